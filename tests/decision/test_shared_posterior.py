@@ -21,7 +21,8 @@ from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.posterior import compute_posterior, log_prior, marginal_likelihood_of
 from failuretwin.inference.theta import shared_likelihood
-from failuretwin.inference.theta.shared_posterior import Mixture, set_up_in_doubt, shared_posterior
+from failuretwin.inference.engine.registration import sensor_in_doubt
+from failuretwin.inference.theta.shared_posterior import Mixture, shared_posterior
 from failuretwin.inference.theta.shared_unknowns import registered_evidence
 from failuretwin.inference.theta.shared_weighing import SharedWeighing
 
@@ -181,7 +182,7 @@ def weighing(twin, runs, imperfections=KNOWN, priors=UNSURE, names=TRUTHS):
 
 
 def in_doubt(asked):
-    return set_up_in_doubt(asked.likelihood, asked.hypotheses, asked.priors)
+    return sensor_in_doubt(asked.likelihood, asked.hypotheses, asked.priors)
 
 
 def test_a_set_up_is_in_doubt_where_most_runs_say_so(twin, armpi, runs):

@@ -17,7 +17,9 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import as_floats
+from failuretwin.inference.engine.registration import sensor_in_doubt
 from failuretwin.inference.engine.runs import has_rows
+from failuretwin.inference.engine.weighing import ALLOWED_FOR
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import FITS, run_misfit
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -45,8 +47,6 @@ from failuretwin.inference.set_ups.set_ups import (
     turned,
 )
 from failuretwin.inference.theta.shared_posterior import (
-    ALLOWED_FOR,
-    set_up_in_doubt,
     shared_posterior,
 )
 
@@ -129,7 +129,7 @@ class SeenRuns:
     def in_doubt(self) -> bool:
         """Whether the sensor may stand a little elsewhere than the profile says, by any robot."""
         return all(
-            set_up_in_doubt(replace(self.sample, model=one.model), self.hypotheses, self.priors)
+            sensor_in_doubt(replace(self.sample, model=one.model), self.hypotheses, self.priors)
             for one in robot_components(self.healthy, self.priors)[:2]
         )
 

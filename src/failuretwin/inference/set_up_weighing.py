@@ -21,6 +21,8 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
+from failuretwin.inference.engine.registration import displaced_evidence
+from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import highest_and_outlier
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -28,10 +30,7 @@ from failuretwin.inference.posterior import log_prior, marginal_likelihoods
 from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp, with_doubt
 from failuretwin.inference.set_ups.log_correction import LogCorrection
 from failuretwin.inference.set_ups.set_ups import FEWEST_TO_TURN, SetUp, mistakes, turned, zero_off
-from failuretwin.inference.theta.shared_likelihood import has_score
-from failuretwin.inference.theta.shared_posterior import Mixture
 from failuretwin.inference.theta.shared_unknowns import layout_of
-from failuretwin.inference.theta.shared_weighing import SharedWeighing
 
 FEW = 8
 """Runs that set-ups are weighed by, evenly spread: five name what shows."""
@@ -141,12 +140,10 @@ class SetUpWeighing:
 
         Where no hypothesis has a score, none tells where it stands: it is where the profile has it.
         """
-        if not any(has_score(h) for h in self.hypotheses):
+        if not any(has_rows(h) for h in self.hypotheses):
             return self.weigh([set_up], everything=True)[0]
         likelihood = self.behind([set_up])
-        weighing = SharedWeighing(likelihood, self.hypotheses, self.priors)
-        mixture = Mixture.of(weighing, weighing.candidates)
-        log_joint = log_sum(mixture.log_evidence, axis=1) + self.log_odds
+        log_joint = displaced_evidence(likelihood, self.hypotheses, self.priors) + self.log_odds
         found = _weighed([set_up], likelihood, log_sum(log_joint, axis=1), CHOICE_NATS)[0]
         return replace(found, moved=True)
 

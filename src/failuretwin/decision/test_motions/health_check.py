@@ -27,6 +27,7 @@ from failuretwin.decision.acting.judging import shown_faults
 from failuretwin.digital_model.nonidealities import Variation
 from failuretwin.failure_behavior.mode import Range, Signature
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.engine.registration import sensor_in_doubt
 from failuretwin.inference.faults.priors import Priors, visible_sizes
 from failuretwin.inference.isolability import IsolabilityReport
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -37,7 +38,6 @@ from failuretwin.inference.posterior import Posterior, log_prior
 from failuretwin.inference.theta.shared_belief import mixed
 from failuretwin.inference.theta.shared_posterior import (
     Mixture,
-    set_up_in_doubt,
     shared_posterior,
 )
 from failuretwin.inference.theta.shared_unknowns import REGISTRATION, SharedLayout
@@ -202,7 +202,7 @@ def judged(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> Posterior:
     """Return the posterior of runs, with what is doubted of the arm integrated out."""
-    in_doubt = set_up_in_doubt(likelihood, hypotheses, priors)
+    in_doubt = sensor_in_doubt(likelihood, hypotheses, priors)
     return shared_posterior(likelihood, hypotheses, priors, in_doubt)
 
 

@@ -9,6 +9,9 @@ Section: docs/inference.md#runs
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
@@ -142,12 +145,48 @@ def _outcome_probability(evidence: RunsEvidence, h: int, pick: int) -> FloatArra
     return table
 
 
+@dataclass(frozen=True)
+class ThetaPart:
+    """Theta under the picks of one hypothesis that count.
+
+    Attributes:
+        hypothesis: Its index.
+        places: Indices of the picks among all of the hypothesis, (pick,).
+        picks: The picks.
+        weight: Their posterior probability in their run, (pick,).
+        mean: (pick, theta).
+        covariance: (pick, theta, theta).
+    """
+
+    hypothesis: int
+    places: IntArray
+    picks: Picks
+    weight: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+
+
+def theta_parts(evidence: RunsEvidence, least: float = LEAST_SHARE) -> list[ThetaPart]:
+    """Return theta under all picks that are more probable than `least`, by hypothesis."""
+    whole = log_sum(evidence.by_hypothesis + evidence.log_odds, axis=1)
+    return [_theta_of(evidence, h, whole, least) for h in range(len(evidence.hypotheses))]
+
+
 def theta_posterior(evidence: RunsEvidence) -> tuple[FloatArray, FloatArray]:
     """Return mean (run, theta) and covariance (run, theta, theta) of theta over all hypotheses."""
-    parts = [_theta_of(evidence, h) for h in range(len(evidence.hypotheses))]
-    run, weight, mean, covariance = (np.concatenate(p) for p in zip(*parts, strict=True))
-    runs, size = evidence.scene.moments.runs, mean.shape[-1]
-    total, centre = np.zeros(runs), np.zeros((runs, size))
+    return pooled(theta_parts(evidence), evidence.scene.moments.runs)
+
+
+def pooled(parts: Sequence[ThetaPart], runs: int) -> tuple[FloatArray, FloatArray]:
+    """Return mean (run, theta) and covariance of theta of some runs over several parts."""
+    run, weight, mean, covariance = (
+        np.concatenate(values)
+        for values in zip(
+            *((p.picks.run, p.weight, p.mean, p.covariance) for p in parts), strict=True
+        )
+    )
+    size = mean.shape[-1]
+    total, centre = np.full(runs, 1e-300), np.zeros((runs, size))
     np.add.at(total, run, weight)
     weight = weight / total[run]
     np.add.at(centre, run, weight[:, None] * mean)
@@ -157,21 +196,107 @@ def theta_posterior(evidence: RunsEvidence) -> tuple[FloatArray, FloatArray]:
     return centre, spread
 
 
-def _theta_of(
-    evidence: RunsEvidence, h: int
-) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Return run, weight, mean and covariance of theta of the picks of a hypothesis that count."""
+def _theta_of(evidence: RunsEvidence, h: int, whole: FloatArray, least: float) -> ThetaPart:
     one = evidence.weighed[h]
-    says = one.log_evidence + evidence.components.weight(one.picks.run, one.picks.component)
-    whole = log_sum(evidence.by_hypothesis + evidence.log_odds, axis=1)
-    weight = np.exp(says + evidence.log_odds[h] - whole[one.picks.run])
-    some = np.flatnonzero(weight > LEAST_SHARE)
-    picks: Picks = one.picks[some]
-    part = NarrowPart(
-        evidence.scene, evidence.rows[h], picks, evidence.components, evidence.narrowed[h]
-    )
-    mean, covariance = theta_given(part, one.found.information[some], one.found.shift[some])
-    return picks.run, weight[some], mean, covariance
+    weight = np.exp(evidence.height(h) - whole[one.picks.run])
+    return theta_of_picks(evidence, h, np.flatnonzero(weight > least), weight)
+
+
+def theta_of_picks(
+    evidence: RunsEvidence, h: int, places: IntArray, weight: FloatArray
+) -> ThetaPart:
+    """Return theta under some picks of a hypothesis.
+
+    Args:
+        evidence: The runs.
+        h: Index of the hypothesis.
+        places: Which of its picks.
+        weight: Probability of all of its picks, (pick,).
+    """
+    one = evidence.weighed[h]
+    picks, found = one.picks[places], one.found[places]
+    part = evidence.narrow_part(h, picks)
+    mean, covariance = theta_given(part, found.information, found.shift)
+    return ThetaPart(h, places, picks, weight[places], mean, covariance)
+
+
+def most_probable_theta(evidence: RunsEvidence) -> tuple[IntArray, FloatArray]:
+    """Return the most probable hypothesis of each run, (run,), and its mean of theta.
+
+    Theta is that of its most probable row and component, (run, theta).
+    """
+    runs, count = evidence.scene.moments.runs, len(evidence.hypotheses)
+    best, place = np.full((runs, count), -np.inf), np.zeros((runs, count), dtype=np.int64)
+    for h, one in enumerate(evidence.weighed):
+        height = evidence.height(h)
+        order = np.argsort(height, kind="stable")
+        run = one.picks.run[order]
+        best[run, h], place[run, h] = height[order], order
+    likely = (evidence.by_hypothesis + evidence.log_odds).argmax(axis=1)
+    theta = np.zeros((runs, evidence.scene.layout.size))
+    for h in np.unique(likely).tolist():
+        rows = np.flatnonzero(likely == h)
+        part = theta_of_picks(evidence, h, place[rows, h], np.exp(evidence.height(h)))
+        theta[part.picks.run] = part.mean
+    return likely, theta
+
+
+def theta_factors(evidence: RunsEvidence) -> tuple[FloatArray, FloatArray]:
+    """Return what each run alone says of theta as a normal factor, whatever is believed of it.
+
+        exp(-1/2 theta^T Lambda theta + eta^T theta),    Lambda = A^T W A,    eta = A^T b
+
+    with A = [G H], the amount integrated out, averaged over all rows by their probability.
+
+    Returns:
+        Lambda (run, theta, theta) and eta (run, theta).
+    """
+    runs, size = evidence.scene.moments.runs, evidence.scene.layout.size
+    information, shift = np.zeros((runs, size, size)), np.zeros((runs, size))
+    for part in theta_parts(evidence):
+        own, pull = _factors_of(evidence, part)
+        np.add.at(information, part.picks.run, part.weight[:, None, None] * own)
+        np.add.at(shift, part.picks.run, part.weight[:, None] * pull)
+    return information, shift
+
+
+def _factors_of(evidence: RunsEvidence, part: ThetaPart) -> tuple[FloatArray, FloatArray]:
+    h, picks = part.hypothesis, part.picks
+    rows, found = evidence.rows[h], evidence.weighed[h].found[part.places]
+    narrow = evidence.narrow_part(h, picks)
+    G = narrow.narrow.columns[narrow.place]
+    lever = rows.lever[picks.run, picks.row]
+    A = np.concatenate([G, lever[..., None]], axis=-1)
+    whole = np.einsum("pmct,pmcd,pmdu->ptu", A, found.information, A, optimize=True)
+    pull = np.einsum("pmct,pmc->pt", A, found.shift)
+    variance = rows.variance[picks.run, picks.row]
+    own = whole[:, -1, -1] + 1.0 / np.maximum(variance, 1e-18)
+    across = whole[:, :-1, -1]
+    information = whole[:, :-1, :-1] - across[:, :, None] * across[:, None] / own[:, None, None]
+    return information, pull[:, :-1] - across * (pull[:, -1] / own)[:, None]
+
+
+OUTLYING = 100.0
+"""Squared distance that stands for an outlier when the fit of a run is judged."""
+
+
+def misfit_of(evidence: RunsEvidence) -> FloatArray:
+    """Return the mean squared distance of the moments of each run in scales, (run,)."""
+    total = np.zeros(evidence.scene.moments.runs)
+    for part in theta_parts(evidence):
+        found = evidence.weighed[part.hypothesis].found[part.places]
+        narrow = evidence.narrow_part(part.hypothesis, part.picks)
+        usable = evidence.scene.moments.usable[part.picks.run]
+        square = np.zeros(usable.shape)
+        for m in range(usable.shape[1]):
+            mixture, share = narrow.mixture_at(m), found.share[:, m]
+            off = mixture.residual - found.mean[:, None, m]
+            solved = np.linalg.solve(mixture.scale, off[..., None])[..., 0]
+            square[:, m] = np.sum(share * np.sum(off * solved, axis=-1), axis=1)
+            square[:, m] += OUTLYING * (1.0 - share.sum(axis=1))
+        mean = np.sum(np.where(usable, square, 0.0), axis=1) / np.maximum(usable.sum(axis=1), 1)
+        np.add.at(total, part.picks.run, part.weight * mean)
+    return total
 
 
 def theta_given(

@@ -204,6 +204,16 @@ class RunsEvidence:
         """Log p(run | h), (run, hypothesis)."""
         return log_sum(self.log_evidence, axis=1)
 
+    def height(self, h: int) -> FloatArray:
+        """Return the log of prior times evidence of all picks of a hypothesis, (pick,)."""
+        one = self.weighed[h]
+        weight = self.components.weight(one.picks.run, one.picks.component)
+        return one.log_evidence + weight + self.log_odds[h]
+
+    def narrow_part(self, h: int, picks: Picks) -> NarrowPart:
+        """Return some picks of a hypothesis, ready for the filter."""
+        return NarrowPart(self.scene, self.rows[h], picks, self.components, self.narrowed[h])
+
     def _all_rows(self, h: int) -> Picks:
         run, row = np.nonzero(np.isfinite(self.rows[h].log_prior))
         return Picks(run, row, np.zeros_like(row))
@@ -273,7 +283,7 @@ class RunsEvidence:
         rows = self.rows[h]
         part: Part | NarrowPart
         if h in self.narrowed:
-            part = NarrowPart(self.scene, rows, picks, self.components, self.narrowed[h])
+            part = self.narrow_part(h, picks)
         else:
             G = rows.columns[picks.run, picks.row_of(rows.columns)]
             part = Part(self.scene, rows, picks, self.components, G, G[:, :, :1])

@@ -11,11 +11,11 @@ Section: docs/inference.md#theta
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.theta.shared_unknowns import loads, offset_deviation, typical_load
@@ -77,6 +77,7 @@ class Components:
         covariance: V, (normal, theta, theta) or (run, normal, theta, theta).
         sigma: Factor on the scatter of the motors, (component,).
         noise_m: Noise of the sensor, (component,) [m].
+        displaced: Whether the sensor stands elsewhere than the profile says, (component,).
     """
 
     log_weight: FloatArray
@@ -85,10 +86,35 @@ class Components:
     covariance: FloatArray
     sigma: FloatArray
     noise_m: FloatArray
+    displaced: BoolArray
+
+    @classmethod
+    def normal_of(cls, covariance: FloatArray, noise_m: float) -> Components:
+        """Return one normal distribution about 0 of a robot that scatters as its class.
+
+        Args:
+            covariance: V, (theta, theta).
+            noise_m: Noise of the sensor [m].
+        """
+        none = np.zeros(1)
+        return cls(
+            none,
+            np.zeros(1, dtype=np.int64),
+            np.zeros((1, len(covariance))),
+            covariance[None],
+            np.ones(1),
+            np.array([noise_m]),
+            np.zeros(1, dtype=bool),
+        )
 
     def __len__(self) -> int:
         """How many."""
         return len(self.sigma)
+
+    @property
+    def first(self) -> Components:
+        """The first one alone."""
+        return Components.normal_of(self.covariance[0], float(self.noise_m[0]))
 
     @property
     def normals(self) -> int:
@@ -97,10 +123,14 @@ class Components:
 
     def theta(self, run: IntArray, normal: IntArray | int) -> tuple[FloatArray, FloatArray]:
         """Return V and mu of some normal distributions in some runs, (pick, ...)."""
-        if self.mean.ndim == 2:
-            normal = np.broadcast_to(normal, run.shape)
-            return self.covariance[normal], self.mean[normal]
-        return self.covariance[run, normal], self.mean[run, normal]
+        normal = np.broadcast_to(normal, run.shape)
+        mean = self.mean[normal] if self.mean.ndim == 2 else self.mean[run, normal]
+        shared = self.covariance.ndim == 3
+        return self.covariance[normal] if shared else self.covariance[run, normal], mean
+
+    def about(self, place: FloatArray) -> Components:
+        """Return the same for runs that are expanded about some theta each, (run, theta)."""
+        return replace(self, mean=self.mean - place[:, None])
 
     def weight(self, run: IntArray, component: IntArray) -> FloatArray:
         """Return the log weight of some components in some runs, (pick,)."""
@@ -185,6 +215,7 @@ def robot_components(model: HealthyModel, layout: Layout, factors: bool) -> Comp
         covariance,
         np.array(sigma),
         model.path_noise * np.array(kappa),
+        np.zeros(len(sigma), dtype=bool),
     )
 
 

@@ -21,7 +21,11 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.engine.unknown_robots import speaks_of, unknown_robot_posterior
+from failuretwin.inference.engine.registration import (
+    displaced_posterior,
+    robot_posterior,
+)
+from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.faults.marginal import MarginalLikelihood
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -32,8 +36,7 @@ from failuretwin.inference.posterior import (
 )
 from failuretwin.inference.set_ups.set_ups import odd_zero
 from failuretwin.inference.theta.linear_response import LinearResponse
-from failuretwin.inference.theta.shared_likelihood import has_score
-from failuretwin.inference.theta.shared_unknowns import REGISTRATION, registered
+from failuretwin.inference.theta.shared_unknowns import REGISTRATION, layout_of, registered
 from failuretwin.inference.theta.shared_weighing import Candidate, SharedWeighing
 
 SURE = 0.95
@@ -42,53 +45,25 @@ ALLOWED_FOR = "; allowed for"
 """Said where verdicts count with it."""
 
 
-def set_up_in_doubt(
-    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
-) -> bool:
-    """Return whether runs that share a set-up say that it may be off.
-
-    Those that two faults explain best say nothing of it.
-
-    Args:
-        likelihood: Some of the runs, as they were seen.
-        hypotheses: What may be the case.
-        priors: Beliefs about faults and set-ups.
-    """
-    scored = [h for h in hypotheses if has_score(h)]
-    if priors.setup.doubt == 0.0 or not scored or not likelihood.model.sensors.tool_alone:
-        return False
-    settled = replace(likelihood, moving=None)
-    told = [*scored, *(h for h in hypotheses if len(h.faults) > 1)]
-    best = np.argmax(compute_posterior(settled, told, priors).log_posterior, axis=1)
-    single = best < len(scored)
-    if not single.any():
-        return False
-    return SharedWeighing(settled[np.flatnonzero(single)], scored, priors).suspect(best[single])
-
-
 def shared_posterior(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors, in_doubt: bool
 ) -> Posterior:
     """Weigh every hypothesis by some runs, what they share integrated out.
 
-    The engine weighs runs by their rests where the set-up is not in doubt and rests tell of all
-    hypotheses. Where none has a score, no theta can be searched for: all is then taken as told.
+    Where no hypothesis has rows, theta is taken as told; so it is where nothing of it is unknown.
 
     Args:
         likelihood: The runs as they were seen.
         hypotheses: What may be the case.
         priors: Beliefs about faults and set-ups.
-        in_doubt: Whether their set-up may be off.
+        in_doubt: Whether their sensor may be displaced.
     """
-    if not in_doubt and speaks_of(likelihood, hypotheses):
-        return unknown_robot_posterior(likelihood, hypotheses, priors)
-    if not any(has_score(h) for h in hypotheses):
+    if not any(has_rows(h) for h in hypotheses):
         return compute_posterior(likelihood, hypotheses, priors)
-    weighing = SharedWeighing(likelihood, hypotheses, priors)
     if in_doubt:
-        return Mixture.of(weighing, weighing.candidates).posterior()
-    if weighing.layout.offsets or likelihood.model.sensors.in_doubt:
-        return Mixture.of(weighing, weighing.as_told).posterior()
+        return displaced_posterior(likelihood, hypotheses, priors)
+    if layout_of(likelihood.model).offsets or likelihood.model.sensors.in_doubt:
+        return robot_posterior(likelihood, hypotheses, priors)
     return compute_posterior(likelihood, hypotheses, priors)
 
 

@@ -14,13 +14,13 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
+from failuretwin.inference.engine.registration import sensor_in_doubt
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.theta.shared_belief import Belief
 from failuretwin.inference.theta.shared_likelihood import Normal
-from failuretwin.inference.theta.shared_posterior import set_up_in_doubt
 from failuretwin.inference.theta.shared_unknowns import REGISTRATION
 from failuretwin.inference.theta.shared_weighing import SharedWeighing
 from failuretwin.inference.together.runs_together import CHUNK_RUNS, RunsTogether
@@ -138,7 +138,7 @@ def doubted(weighing: SharedWeighing) -> bool:
     """Return whether some of the runs, evenly spread, say that the set-up may be off."""
     runs = len(weighing.nowhere)
     some = np.unique(np.linspace(0, runs - 1, CHUNK_RUNS // 2).astype(np.int64))
-    return set_up_in_doubt(weighing.likelihood[some], weighing.hypotheses, weighing.priors)
+    return sensor_in_doubt(weighing.likelihood[some], weighing.hypotheses, weighing.priors)
 
 
 def _in_doubt(deviation: FloatArray, broad: FloatArray) -> FloatArray:

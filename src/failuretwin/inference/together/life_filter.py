@@ -22,6 +22,7 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections
+from failuretwin.inference.engine.registration import sensor_in_doubt
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import SettledEvidence, TransientSamples
@@ -29,7 +30,6 @@ from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.theta.shared_belief import Belief, summed
 from failuretwin.inference.theta.shared_likelihood import Normal
-from failuretwin.inference.theta.shared_posterior import set_up_in_doubt
 from failuretwin.inference.theta.shared_unknowns import REGISTRATION, SharedLayout, layout_of
 from failuretwin.inference.theta.shared_weighing import SharedWeighing
 from failuretwin.inference.together.folder_posterior import FolderPosterior
@@ -353,7 +353,7 @@ class LifeFilter:
     def _in_doubt(self, window: RunsTogether) -> bool:
         """Return whether the latest runs say that the sensor stands elsewhere."""
         few = window.runs < FEWEST
-        return not few and set_up_in_doubt(window.given, self.hypotheses, self.priors)
+        return not few and sensor_in_doubt(window.given, self.hypotheses, self.priors)
 
     def _look_for_sensor(self, window: RunsTogether) -> None:
         """Let the frame of the sensor be anywhere near, and judge the latest runs anew."""

@@ -1,0 +1,312 @@
+"""A sensor that may stand elsewhere than the profile says: whether, and where.
+
+    p(run | h) = sum over c of w_c  integral of p(run | h, theta) N(theta; 0, V_c) dtheta
+
+over components c: that the sensor is where the profile says, and that origin, turn, scale or all
+three are displaced. G is linear about a registration, so runs are registered first, from coarse to
+fine: what a displaced frame leaves must not look like outliers.
+
+Section: docs/inference.md#shared-unknowns
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.numerics import log_of
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.digital_model.arm_classes import GENERIC_NAME
+from failuretwin.inference.engine.posterior import misfit_of, theta_factors
+from failuretwin.inference.engine.runs import has_rows
+from failuretwin.inference.engine.theta import (
+    REGISTRATION,
+    Components,
+    Layout,
+    layout_of,
+    robot_components,
+)
+from failuretwin.inference.engine.weighing import Weighing, assembled
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.posterior import Posterior, compute_posterior
+from failuretwin.inference.set_ups.setup_prior import SetupPrior
+
+COARSE_TO_FINE = (0.026, 0.004, 0.0)
+"""Noise added while a displaced sensor is registered, as shares of the reach."""
+ILL_FITTING = 8.0
+"""Mean squared distance of a movement above which nothing explains a run, in scales: three axes
+give three if all is well."""
+SUSPECT_NATS, SUSPECT_RUN_NATS, SUSPECT_SHARE = 12.0, 0.2, 0.3
+"""A displaced sensor is weighed where one registration of all runs would explain them better by so
+much, half of the runs by so much each, or where so large a share fits ill."""
+SAMPLED_RUNS, FEW_RUNS = 24, 10
+"""Runs from which the registration of a run set is found; fewer than the second number have a
+registration each."""
+
+
+def robot_weighing(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> Weighing:
+    """Return runs of a robot whose sensor is where the profile says."""
+    layout, components = _usual(likelihood.model)
+    return _weighing(likelihood, hypotheses, priors, layout, components, None)
+
+
+def displaced_weighing(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors, place: FloatArray
+) -> Weighing:
+    """Return runs of a robot whose sensor may be displaced, each about a registration (run, 7)."""
+    layout, usual = _usual(likelihood.model)
+    components = displaced_components(likelihood.model, priors.setup, layout, usual)
+    return _weighing(likelihood, hypotheses, priors, layout, components, place)
+
+
+def _usual(model: HealthyModel) -> tuple[Layout, Components]:
+    layout = layout_of(model.without_doubt)
+    factors = model.imperfections.name == GENERIC_NAME and model.scatter_factor == 1.0
+    return layout, robot_components(model, layout, factors)
+
+
+def _weighing(
+    likelihood: RunLikelihood,
+    hypotheses: Sequence[Hypothesis],
+    priors: Priors,
+    layout: Layout,
+    components: Components,
+    place: FloatArray | None,
+) -> Weighing:
+    if place is None:
+        place = np.zeros((len(likelihood.usable), REGISTRATION))
+    else:
+        about = np.pad(place, ((0, 0), (0, layout.size - REGISTRATION)))
+        components = components.about(about)
+    return Weighing(likelihood, hypotheses, priors, layout, components, place)
+
+
+def displaced_components(
+    model: HealthyModel, prior: SetupPrior, layout: Layout, usual: Components
+) -> Components:
+    """Return what is believed of a robot whose sensor may be displaced, the widest first.
+
+    Args:
+        model: The healthy robot.
+        prior: How far set-ups may be off.
+        layout: Places in theta.
+        usual: What is believed of the robot with its sensor where the profile says.
+    """
+    reach = model.twin.robot.reach
+    near, far = (share * reach for share in prior.origin)
+    little, much = prior.turn_rad
+    cases = [
+        (prior.all_rate, 0.5 * (near + far), 0.5 * (little + much), prior.scale),
+        (prior.origin_rate / 2, near, 0.0, 0.0),
+        (prior.origin_rate / 2, far, 0.0, 0.0),
+        (prior.turn_rate / 2, 0.0, little, 0.0),
+        (prior.turn_rate / 2, 0.0, much, 0.0),
+        (prior.scale_rate, 0.0, 0.0, prior.scale),
+    ]
+    cases = [case for case in cases if case[0] > 0.0]
+    noise = [np.hypot(model.path_noise, share * reach) for share in prior.noise]
+    frames = np.tile(usual.covariance[:1], (len(cases), 1, 1))
+    for place, (_, origin, turn, scale) in zip(frames, cases, strict=True):
+        least = np.repeat([origin, turn, scale], [3, 3, 1]) ** 2
+        some = np.arange(REGISTRATION)
+        place[some, some] = np.maximum(place[some, some], least)
+    rates = np.array([rate for rate, *_ in cases])
+    many, first = len(cases), len(noise)
+    base = float(model.path_noise)
+    return Components(
+        np.concatenate(
+            [
+                log_of(rates),
+                np.full(first, float(log_of(prior.noise_rate / 2))),
+                usual.log_weight + float(np.log1p(-prior.doubt)),
+            ]
+        ),
+        np.concatenate([np.arange(many), np.full(first, many), usual.normal + many]),
+        np.zeros((many + usual.normals, layout.size)),
+        np.concatenate([frames, usual.covariance]),
+        np.concatenate([np.ones(many + first), usual.sigma]),
+        np.concatenate([np.full(many, base), noise, usual.noise_m]),
+        np.arange(many + first + len(usual)) < many,
+    )
+
+
+def _broad(frames: Components, noise_m: float) -> Components:
+    """Return one normal distribution that holds all displacements."""
+    return Components.normal_of(np.maximum.reduce(frames.covariance), noise_m)
+
+
+def _about(
+    likelihood: RunLikelihood,
+    hypotheses: Sequence[Hypothesis],
+    priors: Priors,
+    place: FloatArray,
+    share: float,
+) -> Weighing:
+    """Return runs about some registrations, with a broad prior of it and extra noise."""
+    model = likelihood.model
+    layout, usual = _usual(model)
+    frames = displaced_components(model, priors.setup, layout, usual)
+    noise = float(np.hypot(model.path_noise, share * model.twin.robot.reach))
+    ranked = [h for h in hypotheses if has_rows(h)]
+    broad = _broad(frames, noise)
+    settled = replace(likelihood, moving=None)
+    return _weighing(settled, ranked, priors, layout, broad, place)
+
+
+def registered_each(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> FloatArray:
+    """Return a registration of each run, from coarse to fine, (run, 7)."""
+    place = np.zeros((len(likelihood.usable), REGISTRATION))
+    for share in COARSE_TO_FINE:
+        weighing = _about(likelihood, hypotheses, priors, place, share)
+        place = place + weighing.best[1][:, :REGISTRATION]
+    return place
+
+
+def registered_together(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> FloatArray:
+    """Return one registration of all runs, (7,): the median of some, then theirs together."""
+    count = len(likelihood.usable)
+    rows = np.unique(np.linspace(0, count - 1, min(count, SAMPLED_RUNS)).astype(np.int64))
+    some = likelihood[rows]
+    place = np.median(registered_each(some, hypotheses, priors), axis=0)
+    for share in (COARSE_TO_FINE[1], 0.0, 0.0):
+        weighing = _about(some, hypotheses, priors, np.tile(place, (len(rows), 1)), share)
+        information, shift = (one.sum(axis=0) for one in theta_factors(weighing.evidence))
+        mean, covariance = weighing.components.mean[0, 0], weighing.components.covariance[0]
+        place = place + _newton(information, shift, mean, covariance)[:REGISTRATION]
+    return place
+
+
+def _newton(
+    information: FloatArray, shift: FloatArray, mean: FloatArray, covariance: FloatArray
+) -> FloatArray:
+    """Return the registration that runs share as a Newton step of theta, (theta,).
+
+    Args:
+        information: Sum of what the runs say of theta, (theta, theta).
+        shift: That times the theta that they point to, (theta,).
+        mean: Prior mean, (theta,).
+        covariance: Prior covariance, (theta, theta).
+    """
+    precision = np.linalg.inv(covariance)
+    step = np.linalg.solve(information + precision, shift + precision @ mean)
+    step[REGISTRATION:] = 0.0
+    return np.asarray(step)
+
+
+def sensor_in_doubt(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> bool:
+    """Return whether runs that share a set-up say that the sensor may be displaced.
+
+    Those that two faults explain best say nothing of it.
+
+    Args:
+        likelihood: Some of the runs, as they were seen.
+        hypotheses: What may be the case.
+        priors: Beliefs about faults and set-ups.
+    """
+    ranked = [h for h in hypotheses if has_rows(h)]
+    if priors.setup.doubt == 0.0 or not ranked or not likelihood.model.sensors.tool_alone:
+        return False
+    settled = replace(likelihood, moving=None)
+    told = [*ranked, *(h for h in hypotheses if len(h.faults) > 1)]
+    best = np.argmax(compute_posterior(settled, told, priors).log_posterior, axis=1)
+    single = np.flatnonzero(best < len(ranked))
+    return bool(len(single)) and _suspect(settled[single], ranked, priors, best[single])
+
+
+def _suspect(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors, best: IntArray
+) -> bool:
+    """Return whether the sensor may be displaced, by the most probable hypothesis of each run."""
+    layout, usual = _usual(likelihood.model)
+    size, narrow = layout.size, usual.first
+    information, shift = np.zeros((len(best), size, size)), np.zeros((len(best), size))
+    ill: BoolArray = np.zeros(len(best), dtype=bool)
+    for h in np.unique(best).tolist():
+        rows = np.flatnonzero(best == h)
+        some = _weighing(likelihood[rows], [hypotheses[h]], priors, layout, narrow, None)
+        information[rows], shift[rows] = theta_factors(some.evidence)
+        ill[rows] = misfit_of(some.evidence) > ILL_FITTING
+    frames = displaced_components(likelihood.model, priors.setup, layout, usual)
+    covariance = np.maximum.reduce(frames.covariance)
+    step = _newton(information.sum(axis=0), shift.sum(axis=0), np.zeros(size), covariance)
+    gain = 0.5 * float(shift.sum(axis=0) @ step)
+    of_run = shift @ step - 0.5 * np.einsum("t,rtu,u->r", step, information, step)
+    together = gain > SUSPECT_NATS and float(np.median(of_run)) > SUSPECT_RUN_NATS
+    return together or bool(ill.mean() > SUSPECT_SHARE)
+
+
+# The posterior of runs in chunks, each about the better of two registrations.
+
+CHUNK_RUNS = 16
+"""Runs that are weighed at a time: columns of all rows and outcomes stay below 100 MB."""
+
+
+def robot_posterior(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> Posterior:
+    """Return the posterior of runs whose sensor is where the profile says."""
+    chunks = _chunks(len(likelihood.usable))
+    parts = [robot_weighing(likelihood[rows], hypotheses, priors) for rows in chunks]
+    return assembled(likelihood, [one.posterior() for one in parts], *_in_turn(chunks))
+
+
+def displaced_posterior(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> Posterior:
+    """Return the posterior of runs whose sensor may be displaced."""
+    parts, better = _about_the_better(likelihood, hypotheses, priors)
+    some = [one.posterior() for one in parts]
+    chunks = _chunks(len(likelihood.usable))
+    part, row = _in_turn(chunks)
+    return assembled(likelihood, some, part + len(chunks) * better, row)
+
+
+def displaced_evidence(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> FloatArray:
+    """Return log p(run | h) of runs whose sensor may be displaced, (run, hypothesis)."""
+    parts, better = _about_the_better(likelihood, hypotheses, priors)
+    table = np.concatenate([one.by_hypothesis for one in parts])
+    runs = len(better)
+    return table[np.arange(runs) + runs * better]
+
+
+def _about_the_better(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> tuple[list[Weighing], IntArray]:
+    """Return chunks of runs about 0, then about a registration, and which explains each run."""
+    runs = len(likelihood.usable)
+    if runs < FEW_RUNS:
+        place = registered_each(likelihood, hypotheses, priors)
+    else:
+        place = np.tile(registered_together(likelihood, hypotheses, priors), (runs, 1))
+    parts = [
+        displaced_weighing(likelihood[rows], hypotheses, priors, where[rows])
+        for where in (np.zeros_like(place), place)
+        for rows in _chunks(runs)
+    ]
+    total = np.concatenate([one.total for one in parts]).reshape(2, runs)
+    return parts, np.argmax(total, axis=0)
+
+
+def _chunks(runs: int) -> list[IntArray]:
+    return [np.arange(at, min(at + CHUNK_RUNS, runs)) for at in range(0, runs, CHUNK_RUNS)]
+
+
+def _in_turn(chunks: Sequence[IntArray]) -> tuple[IntArray, IntArray]:
+    """Return the chunk and the place in it of each run."""
+    part, row = np.divmod(np.concatenate(chunks), CHUNK_RUNS)
+    return part, row

@@ -1,0 +1,269 @@
+"""Every hypothesis weighed by runs whose theta is a mixture of normal distributions.
+
+Hypotheses with rows go through the engine. The others (faults of the way, of two motors, or
+unknown ones) and readings on the way are weighed at the most probable theta of each run:
+
+    log p(run | h) = log p(run | h*) + log p(run | theta*, h) - log p(run | theta*, h*)
+
+with h* the most probable hypothesis with rows and theta* its mean.
+
+Section: docs/inference.md#runs
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.numerics import log_sum
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.inference.engine.moments import moments_of
+from failuretwin.inference.engine.posterior import (
+    marginal_likelihoods as engine_likelihoods,
+)
+from failuretwin.inference.engine.posterior import most_probable_theta, theta_posterior
+from failuretwin.inference.engine.rows import Scene
+from failuretwin.inference.engine.runs import RunsEvidence, has_rows
+from failuretwin.inference.engine.theta import REGISTRATION, Components, Layout
+from failuretwin.inference.faults.marginal import MarginalLikelihood
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.posterior import Posterior, log_prior, marginal_likelihoods
+from failuretwin.inference.set_ups.set_ups import odd_zero
+from failuretwin.inference.theta.shared_unknowns import (
+    registered,
+    registered_evidence,
+    registered_samples,
+)
+
+TOLD = 0.9
+"""Probability from which a run says what it had to assume of its robot."""
+SURE = 0.95
+"""Probability of a displaced sensor from which it is told."""
+ALLOWED_FOR = "; allowed for"
+"""Said where verdicts count with it."""
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """Some runs, and what is believed of their theta.
+
+    Attributes:
+        likelihood: The runs as they were seen.
+        hypotheses: What may be the case; one of them has rows.
+        priors: Beliefs about faults and set-ups.
+        layout: Places in theta.
+        components: What is believed of theta, beside the place of each run.
+        place: Registration about which each run is expanded, (run, 7).
+    """
+
+    likelihood: RunLikelihood
+    hypotheses: Sequence[Hypothesis]
+    priors: Priors
+    layout: Layout
+    components: Components
+    place: FloatArray
+
+    @cached_property
+    def log_odds(self) -> FloatArray:
+        """Log prior of each hypothesis, (hypothesis,)."""
+        return log_prior(self.hypotheses, self.priors)
+
+    @cached_property
+    def with_rows(self) -> IntArray:
+        """Hypotheses with rows."""
+        return np.flatnonzero([has_rows(h) for h in self.hypotheses])
+
+    @cached_property
+    def evidence(self) -> RunsEvidence:
+        """What the runs say of the hypotheses with rows."""
+        model = self.likelihood.model
+        seen = registered_evidence(self.likelihood.evidence, self.place, model.sensors)
+        scene = Scene.of(
+            model.without_doubt,
+            moments_of(model, seen),
+            self.priors,
+            self.layout,
+            self.components.covariance[0],
+        )
+        hypotheses = [self.hypotheses[i] for i in self.with_rows]
+        return RunsEvidence(scene, hypotheses, self.components, self.log_odds[self.with_rows])
+
+    @cached_property
+    def best(self) -> tuple[IntArray, FloatArray]:
+        """The most probable hypothesis with rows of each run, and its mean of theta."""
+        return most_probable_theta(self.evidence)
+
+    @cached_property
+    def at_best(self) -> RunLikelihood:
+        """The runs as a robot and a sensor would have shown them whose theta is 0."""
+        _, theta = self.best
+        likelihood, scene = self.likelihood, self.evidence.scene
+        model, way = likelihood.model, likelihood.moving
+        offset = np.einsum("rmct,rt->rmc", scene.columns[:, :, 0], theta)
+        seen = registered_evidence(likelihood.evidence, self.place, model.sensors)
+        seen = replace(seen, point=seen.point - offset)
+        if way is not None:
+            way = registered_samples(way, self.place + theta[:, :REGISTRATION], model.sensors)
+        return RunLikelihood(seen, model.without_doubt, way)
+
+    @cached_property
+    def _settled_at_best(self) -> list[MarginalLikelihood]:
+        """Settled positions at the most probable theta, by hypothesis."""
+        alone = replace(self.at_best, moving=None)
+        return marginal_likelihoods(alone, self.hypotheses, self.priors)
+
+    @cached_property
+    def _whole_at_best(self) -> list[MarginalLikelihood]:
+        """All readings at the most probable theta, by hypothesis."""
+        if self.likelihood.moving is None:
+            return self._settled_at_best
+        return marginal_likelihoods(self.at_best, self.hypotheses, self.priors)
+
+    @cached_property
+    def log_evidence(self) -> FloatArray:
+        """Log of weight times evidence, (run, component, hypothesis)."""
+        found = self.evidence.log_evidence
+        if len(self.with_rows) == len(self.hypotheses) and self.likelihood.moving is None:
+            return found
+        settled, whole = (
+            np.stack([one.log_evidence for one in says], axis=1)
+            for says in (self._settled_at_best, self._whole_at_best)
+        )
+        rows, (best, _) = np.arange(len(found)), self.best
+        more = settled - settled[rows, self.with_rows[best], None]
+        table = found[rows, :, best][..., None] + more[:, None]
+        table[..., self.with_rows] = found
+        return np.asarray(table + (whole - settled)[:, None])
+
+    @property
+    def by_hypothesis(self) -> FloatArray:
+        """Log p(run | h), (run, hypothesis)."""
+        return log_sum(self.log_evidence, axis=1)
+
+    @property
+    def total(self) -> FloatArray:
+        """Log p(run) over the hypotheses with rows, (run,)."""
+        return log_sum(self.evidence.by_hypothesis + self.evidence.log_odds, axis=1)
+
+    def weights(self) -> list[MarginalLikelihood]:
+        """Return what the runs say of each hypothesis, with onset and size."""
+        total, found = self.by_hypothesis, dict[int, MarginalLikelihood]()
+        if self.likelihood.moving is None:
+            says = engine_likelihoods(self.evidence)
+            found = dict(zip(self.with_rows.tolist(), says, strict=True))
+        return [
+            replace(found.get(h) or self._whole_at_best[h], log_evidence=total[:, h])
+            for h in range(len(self.hypotheses))
+        ]
+
+    def posterior(self) -> Posterior:
+        """Return the posterior over hypotheses."""
+        log_joint = self.by_hypothesis + self.log_odds
+        return Posterior(
+            self.likelihood,
+            self.hypotheses,
+            self.log_odds,
+            log_joint - log_sum(log_joint, axis=1)[:, None],
+            self.weights(),
+            self.remarks,
+            self.odd_zeros,
+        )
+
+    @cached_property
+    def share(self) -> FloatArray:
+        """Probability of each component and hypothesis, (run, component, hypothesis)."""
+        height = self.log_evidence + self.log_odds
+        return np.exp(height - log_sum(height, axis=(1, 2))[:, None, None])
+
+    @property
+    def remarks(self) -> list[str]:
+        """What each run had to assume of its robot and its sensor; empty where nothing."""
+        share = self.share.sum(axis=2)
+        return [self._remark(run, one) for run, one in enumerate(share)]
+
+    def _remark(self, run: int, share: FloatArray) -> str:
+        components = self.components
+        wide = components.sigma > 1.0
+        noisy = components.noise_m > 1.5 * self.likelihood.model.path_noise
+        said = []
+        if share[components.displaced].sum() > SURE:
+            said.append(
+                "the sensor does not seem to stand where the profile says "
+                f"({share[components.displaced].sum():.1%}): the tool appears about "
+                f"{self._distance_mm(run):.2g} mm off{ALLOWED_FOR}. `failuretwin robot fit` on "
+                "healthy runs finds its frame"
+            )
+        if share[wide].sum() > TOLD:
+            factor = components.sigma[int(np.argmax(np.where(wide, share, 0.0)))]
+            said.append(
+                f"the motors seem to scatter about {factor:g} times as much as arms of this "
+                "class do; judged so"
+            )
+        if share[noisy].sum() > TOLD:
+            noise = 1e3 * components.noise_m[int(np.argmax(np.where(noisy, share, 0.0)))]
+            said.append(
+                f"the sensor seems noisier than is known of it: by about {noise:.2g} mm; judged so"
+            )
+        return "; ".join(said)
+
+    def _distance_mm(self, run: int) -> float:
+        """Return how far the sensor's frame moves the tool of a run in the mean [mm]."""
+        theta = self.place[run] + self.best[1][run, :REGISTRATION]
+        evidence = self.likelihood.evidence
+        seen = evidence.point[run][evidence.usable[run]]
+        away = registered(seen[None], theta[None])[0] - seen
+        return 1e3 * float(np.linalg.norm(away, axis=1).mean())
+
+    @property
+    def odd_zeros(self) -> list[str]:
+        """Which zero of each run is far off what such robots do; empty where none is."""
+        motors = self.layout.motors
+        zeros = slice(REGISTRATION, REGISTRATION + motors)
+        usual = np.sqrt(np.diag(self.components.covariance[0]))[zeros]
+        mean, covariance = theta_posterior(self.evidence)
+        deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, zeros]
+        sure = np.maximum(np.abs(mean[:, zeros]) - 2.0 * deviation, 0.0) / usual
+        robot = self.likelihood.model.twin.robot
+        return [odd_zero(robot, *pair) for pair in zip(mean[:, zeros], sure, strict=True)]
+
+
+def assembled(
+    likelihood: RunLikelihood, parts: Sequence[Posterior], part: IntArray, row: IntArray
+) -> Posterior:
+    """Return the posterior of runs that were weighed in parts.
+
+    Args:
+        likelihood: All runs.
+        parts: Posteriors of some of them.
+        part: Which holds each run, (run,).
+        row: Its place there, (run,).
+    """
+    first = parts[0]
+    places = list(zip(part.tolist(), row.tolist(), strict=True))
+
+    def weight(h: int) -> MarginalLikelihood:
+        def of(run: int) -> tuple[MarginalLikelihood, int]:
+            p, r = places[run]
+            return parts[p].weights[h], r
+
+        return MarginalLikelihood(
+            np.array([parts[p].weights[h].log_evidence[r] for p, r in places]),
+            lambda run: of(run)[0].by_movement(of(run)[1]),
+            lambda run: of(run)[0].settled(of(run)[1]),
+            lambda run: of(run)[0].estimate(of(run)[1]),
+        )
+
+    return Posterior(
+        likelihood,
+        first.hypotheses,
+        first.log_prior,
+        np.stack([parts[p].log_posterior[r] for p, r in places]),
+        [weight(h) for h in range(len(first.hypotheses))],
+        [parts[p].set_up[r] for p, r in places],
+        [parts[p].offsets[r] for p, r in places],
+    )
