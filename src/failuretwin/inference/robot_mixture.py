@@ -4,8 +4,7 @@
     p(c | run) ~ w_c sum over h of p(h) p(run | h, c)
 
 with components c of the belief about the healthy robot: the named calibration; the population of
-its class; and that population with more lost commands, a larger scatter or a noisier sensor. The
-engine sums over scatter and noise itself where rests tell of all hypotheses.
+its class, whose scatter and noise the engine sums over; and that with more lost commands.
 p(c | run) is that of settled positions, which every component judges. A component is weighed in
 full for the runs that it may explain better: its healthy and its likeliest hypothesis tell which.
 
@@ -25,25 +24,16 @@ from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.nonidealities import with_rates
-from failuretwin.inference.engine.unknown_robots import evidence_by_hypothesis, speaks_of
+from failuretwin.inference.engine.registration import robot_evidence
+from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
-from failuretwin.inference.theta.shared_likelihood import has_score
 from failuretwin.inference.theta.shared_posterior import shared_posterior
-from failuretwin.inference.theta.shared_weighing import SharedWeighing
 
-USUAL = 0.4
-"""Share of robots that scatter as their class does, lose as many commands and are seen as well;
-this and the shares below are assumed: three in five arms were built, mounted or worn otherwise than
-the class says."""
-SCATTER = {2.0: 0.25, 4.0: 0.05}
-"""Factors on the scatter of the class, and the share of robots of each [-]."""
 LOSSES = {3.0: 0.15}
-"""Factors on its rates of lost commands, and the share of robots of each [-]."""
-NOISY = 0.15
-"""Share of robots whose sensor is noisier than is known, for both lengths of `SetupPrior.noise`."""
+"""Factors on the rates of lost commands of the class, and the share of robots of each; assumed."""
 COUNTS_NATS = 3.0
 """A component counts for a run where it comes within this of what explains the run best [nats]."""
 TOLD = 0.9
@@ -65,9 +55,7 @@ class RobotComponent:
     model: HealthyModel
 
 
-def robot_components(
-    model: HealthyModel, priors: Priors, factors: bool = True
-) -> list[RobotComponent]:
+def robot_components(model: HealthyModel, priors: Priors) -> list[RobotComponent]:
     """Return what is believed of a healthy robot; the first is the model itself.
 
     An ideal robot, one whose set-up is known, and one that other sensors watch have no other.
@@ -75,45 +63,35 @@ def robot_components(
     Args:
         model: The named calibration, or the population of its class.
         priors: Beliefs about set-ups.
-        factors: Whether scatter and noise are components here; else the engine sums over them.
     """
     another, known = priors.setup.another_rate, model.imperfections
     if another == 0.0 or known.settling is None or not model.sensors.tool_alone:
         return [RobotComponent("", 0.0, model)]
     if known.name == GENERIC_NAME:
-        return _population(model, priors, "", factors)
+        return _population(model, "", 1.0)
     name = f"these runs do not seem to be of the robot of calibration {known.name!r}"
     usual = generic_imperfections(model.twin.robot)
     usual = replace(usual, protocol=known.protocol, sensors=known.sensors)
-    kind = _population(replace(model, imperfections=usual), priors, name, factors)
-    others = [replace(one, log_weight=one.log_weight + float(log_of(another))) for one in kind]
-    return [RobotComponent("", float(np.log1p(-another)), model), *others]
+    kind = _population(replace(model, imperfections=usual), name, another)
+    return [RobotComponent("", float(np.log1p(-another)), model), *kind]
 
 
-def _population(
-    model: HealthyModel, priors: Priors, name: str, factors: bool
-) -> list[RobotComponent]:
-    """Return the population of a class: as usual first, then what differs from it."""
-    usual = USUAL if factors else 1.0 - sum(LOSSES.values())
-    known, found = model.imperfections, [(name, usual, model)]
-    settling = known.settling
-    assert settling is not None
-    for factor, share in SCATTER.items() if factors else ():
-        scatter = tuple(factor * value for value in settling.scatter)
-        wide = replace(known, settling=replace(settling, scatter=scatter))
-        told = f"the motors seem to scatter about {factor:g} times as much as arms of this class do"
-        found.append((told, share, replace(model, imperfections=wide)))
+def _population(model: HealthyModel, name: str, rate: float) -> list[RobotComponent]:
+    """Return the population of a class: as usual first, then with more lost commands.
+
+    Args:
+        model: The population.
+        name: What is said of a run that it explains.
+        rate: Probability of the population.
+    """
+    usual = rate * (1.0 - sum(LOSSES.values()))
+    found = [RobotComponent(name, float(log_of(usual)), model)]
     for factor, share in LOSSES.items():
+        lossy = replace(model, imperfections=with_rates(model.imperfections, factor))
         told = f"commands seem to get lost about {factor:g} times as often as with such arms"
-        found.append((told, share, replace(model, imperfections=with_rates(known, factor))))
-    for share in priors.setup.noise if factors else ():
-        noise = float(np.hypot(model.untold_noise_m, share * model.twin.robot.reach))
-        told = f"the sensor seems noisier than is known of it: by about {1e3 * noise:.2g} mm"
-        found.append((told, NOISY / 2.0, replace(model, untold_noise_m=noise)))
-    return [
-        RobotComponent("; ".join(filter(None, dict.fromkeys((name, told)))), float(np.log(w)), one)
-        for told, w, one in found
-    ]
+        told = "; ".join(filter(None, (name, told)))
+        found.append(RobotComponent(told, float(log_of(rate * share)), lossy))
+    return found
 
 
 @dataclass(frozen=True)
@@ -220,12 +198,11 @@ class RobotMixture:
         asked = np.tile([h.is_healthy for h in known.hypotheses], (len(best), 1))
         if len(self.parts) == 1:
             asked = asked | (best[:, None] == np.array(many))
-        scored = [i for i in many if asked[:, i].any() and has_score(known.hypotheses[i])]
+        scored = [i for i in many if asked[:, i].any() and has_rows(known.hypotheses[i])]
         if not scored:
             return np.arange(len(best))
         some = [known.hypotheses[i] for i in scored]
-        weigh = _glance_at_rests if speaks_of(likelihood, known.hypotheses) else _glance
-        glance = weigh(likelihood, some, priors, asked[:, scored])
+        glance = _glance(likelihood, some, priors, asked[:, scored])
         says = component.log_weight + (glance + known.log_prior[scored]).max(axis=1)
         reached = log_sum(log_sum(self.log_joint, axis=0), axis=1)
         return np.flatnonzero(says > reached - COUNTS_NATS)
@@ -258,31 +235,18 @@ def _glance(
     priors: Priors,
     asked: BoolArray,
 ) -> FloatArray:
-    """Return the log evidence of some hypotheses by the usual offsets, searched for once.
+    """Return the log evidence of some hypotheses, (run, hypothesis).
 
     Args:
         likelihood: Runs by their settled positions.
-        hypotheses: Those with a score.
+        hypotheses: Those with rows.
         priors: Beliefs about faults and set-ups.
         asked: Which are weighed, (run, hypothesis); the others have none.
     """
-    weighing = SharedWeighing(likelihood, hypotheses, priors)
-    at = weighing.expand(np.arange(len(asked)), weighing.nowhere)
-    prior = at.prior(weighing.parts[0].deviation)
-    return weighing.search(at, prior, weighing.nowhere, asked).log_evidence
-
-
-def _glance_at_rests(
-    likelihood: RunLikelihood,
-    hypotheses: Sequence[Hypothesis],
-    priors: Priors,
-    asked: BoolArray,
-) -> FloatArray:
-    """Return the log evidence of the hypotheses that are asked for by the engine, as `_glance`."""
     found = np.full(asked.shape, -np.inf)
     for which in np.unique(asked, axis=0):
         rows = np.flatnonzero((asked == which).all(axis=1))
         some = [hypotheses[i] for i in np.flatnonzero(which).tolist()]
-        says = evidence_by_hypothesis(likelihood[rows], some, priors)
+        says = robot_evidence(likelihood[rows], some, priors)
         found[np.ix_(rows, np.flatnonzero(which))] = says
     return found

@@ -18,7 +18,6 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import as_floats
 from failuretwin.inference.engine.registration import sensor_in_doubt
-from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.engine.weighing import ALLOWED_FOR
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import FITS, run_misfit
@@ -136,8 +135,7 @@ class SeenRuns:
     @cached_property
     def components(self) -> list[RobotComponent]:
         """What is believed of the healthy robot; the first is the model."""
-        summed = not self.in_doubt and all(has_rows(h) for h in self.hypotheses)
-        return robot_components(self.healthy, self.priors, factors=not summed)
+        return robot_components(self.healthy, self.priors)
 
     def set_ups(self, thorough: bool = False) -> SetUpPosterior:
         """Return what is believed of the set-up: unit and clock first, then all else.

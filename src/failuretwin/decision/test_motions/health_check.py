@@ -21,13 +21,14 @@ from failuretwin.core.hypothesis import (
     Hypothesis,
     motor_probabilities,
 )
-from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.judging import shown_faults
 from failuretwin.digital_model.nonidealities import Variation
 from failuretwin.failure_behavior.mode import Range, Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.engine.registration import sensor_in_doubt
+from failuretwin.inference.engine.posterior import theta_posterior
+from failuretwin.inference.engine.registration import robot_weighing, sensor_in_doubt
+from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.faults.priors import Priors, visible_sizes
 from failuretwin.inference.isolability import IsolabilityReport
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -35,13 +36,7 @@ from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.log_quality import BEYOND_USUAL
 from failuretwin.inference.observation.settings import ERROR_STEPS, WIDEST_ERROR
 from failuretwin.inference.posterior import Posterior, log_prior
-from failuretwin.inference.theta.shared_belief import mixed
-from failuretwin.inference.theta.shared_posterior import (
-    Mixture,
-    shared_posterior,
-)
-from failuretwin.inference.theta.shared_unknowns import REGISTRATION, SharedLayout
-from failuretwin.inference.theta.shared_weighing import Candidate, SharedWeighing
+from failuretwin.inference.theta.shared_posterior import shared_posterior
 
 HEALTHY_TO_FAULTY = 2.0
 """Odds that an arm is healthy that nobody suspects; assumed."""
@@ -109,42 +104,19 @@ def motor_offsets(
 ) -> MotorOffsets:
     """Return the zeros and the play of all motors, hypotheses and lost commands summed out.
 
-        p(b, f | run) = sum over h and components c of P(h, c | run) N(theta_hc, (P_c^-1 + A_hc)^-1)
+        p(b, f | run) = sum over h, rows and components of P(h, row, c | run) N(theta; mean, V)
 
-    with zero b and play 2 f of `inference.theta`. The prior is wide, `LOOSE_RAD`, and not that of
-    the calibration: a check measures what has moved since. A hypothesis that calls a motor faulty
-    leaves the prior of its zero and play. The sensor's frame is taken as the profile states it.
+    with zero b and play 2 f of theta. The prior is wide, `LOOSE_RAD`, and not that of the
+    calibration: a check measures what has moved since. A motor that is called stuck leaves the
+    prior of its zero and play. The sensor's frame is taken as the profile states it.
     """
-    layout = SharedLayout(len(likelihood.model.scatter), offsets=True)
-    weighing = SharedWeighing(_with_loose_offsets(likelihood), hypotheses, priors, layout)
-    candidates = weighing.as_told
-    theta, covariance = zip(*(_normal_of(each, weighing) for each in candidates), strict=True)
-    weight = _best_starts(Mixture.of(weighing, candidates))
-    (mean,), (spread,) = mixed(weight[None], np.stack(theta)[None], np.stack(covariance)[None])
-    zero, _, friction = mean[REGISTRATION:].reshape(3, -1)
-    zero_sd, _, friction_sd = np.sqrt(np.diag(spread)[REGISTRATION:]).reshape(3, -1)
+    ranked = [h for h in hypotheses if has_rows(h)]
+    weighing = robot_weighing(_with_loose_offsets(likelihood), ranked, priors)
+    (mean,), (spread,) = theta_posterior(weighing.evidence)
+    offsets = weighing.layout.offsets
+    zero, _, friction = mean[offsets].reshape(3, -1)
+    zero_sd, _, friction_sd = np.sqrt(np.diag(spread)[offsets]).reshape(3, -1)
     return MotorOffsets(zero, zero_sd, 2.0 * friction, 2.0 * friction_sd)
-
-
-def _normal_of(candidate: Candidate, weighing: SharedWeighing) -> tuple[FloatArray, FloatArray]:
-    """Return mean (hypothesis, theta) and covariance (hypothesis, theta, theta) of one run."""
-    found = candidate.found
-    precision = np.diag(weighing.parts[candidate.component].deviation ** -2.0)
-    return found.theta[0], np.asarray(np.linalg.inv(precision + found.information[0]))
-
-
-def _best_starts(mixture: Mixture) -> FloatArray:
-    """Return the probability of each candidate and hypothesis, (candidate, hypothesis), of one run.
-
-    Candidates of one component are the same posterior searched from several starts: the one with
-    the highest evidence counts.
-    """
-    height = mixture.log_evidence[0] + mixture.weighing.log_odds
-    component = np.array([each.component for each in mixture.candidates])
-    rivals = np.where((component[:, None] == component)[..., None], height, -np.inf)
-    best = np.arange(len(height))[:, None] == np.argmax(rivals, axis=1)
-    height = np.where(best, height, -np.inf)
-    return np.asarray(np.exp(height - log_sum(height, axis=(0, 1))))
 
 
 def _with_loose_offsets(likelihood: RunLikelihood) -> RunLikelihood:

@@ -263,6 +263,15 @@ def robot_posterior(
     return assembled(likelihood, [one.posterior() for one in parts], *_in_turn(chunks))
 
 
+def robot_evidence(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> FloatArray:
+    """Return log p(run | h) of runs whose sensor is where the profile says, (run, hypothesis)."""
+    chunks = _chunks(len(likelihood.usable))
+    parts = [robot_weighing(likelihood[rows], hypotheses, priors) for rows in chunks]
+    return np.concatenate([one.by_hypothesis for one in parts])
+
+
 def displaced_posterior(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> Posterior:
