@@ -17,7 +17,6 @@ from dataclasses import replace
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.core.numerics import log_of
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import GENERIC_NAME
 from failuretwin.inference.engine.posterior import misfit_of, theta_factors
@@ -54,7 +53,8 @@ def robot_weighing(
 ) -> Weighing:
     """Return runs of a robot whose sensor is where the profile says."""
     layout, components = _usual(likelihood.model)
-    return _weighing(likelihood, hypotheses, priors, layout, components, None)
+    place = np.zeros((len(likelihood.usable), REGISTRATION))
+    return Weighing(likelihood, hypotheses, priors, layout, components, place)
 
 
 def displaced_weighing(
@@ -63,7 +63,11 @@ def displaced_weighing(
     """Return runs of a robot whose sensor may be displaced, each about a registration (run, 7)."""
     layout, usual = _usual(likelihood.model)
     components = displaced_components(likelihood.model, priors.setup, layout, usual)
-    return _weighing(likelihood, hypotheses, priors, layout, components, place)
+    components = components.about(np.pad(place, ((0, 0), (0, layout.size - REGISTRATION))))
+    if place.any():  # rows are chosen by a sensor that stands right there
+        there = usual.first.weighted(0.0).about(np.zeros((len(place), layout.size)))
+        components = Components.joined([there, components])
+    return Weighing(likelihood, hypotheses, priors, layout, components, place)
 
 
 def _usual(model: HealthyModel) -> tuple[Layout, Components]:
@@ -72,26 +76,10 @@ def _usual(model: HealthyModel) -> tuple[Layout, Components]:
     return layout, robot_components(model, layout, factors)
 
 
-def _weighing(
-    likelihood: RunLikelihood,
-    hypotheses: Sequence[Hypothesis],
-    priors: Priors,
-    layout: Layout,
-    components: Components,
-    place: FloatArray | None,
-) -> Weighing:
-    if place is None:
-        place = np.zeros((len(likelihood.usable), REGISTRATION))
-    else:
-        about = np.pad(place, ((0, 0), (0, layout.size - REGISTRATION)))
-        components = components.about(about)
-    return Weighing(likelihood, hypotheses, priors, layout, components, place)
-
-
 def displaced_components(
     model: HealthyModel, prior: SetupPrior, layout: Layout, usual: Components
 ) -> Components:
-    """Return what is believed of a robot whose sensor may be displaced, the widest first.
+    """Return what is believed of a robot whose sensor may be displaced; first, that it is not.
 
     Args:
         model: The healthy robot.
@@ -110,31 +98,18 @@ def displaced_components(
         (prior.turn_rate / 2, 0.0, much, 0.0),
         (prior.scale_rate, 0.0, 0.0, prior.scale),
     ]
-    cases = [case for case in cases if case[0] > 0.0]
-    noise = [np.hypot(model.path_noise, share * reach) for share in prior.noise]
-    frames = np.tile(usual.covariance[:1], (len(cases), 1, 1))
-    for place, (_, origin, turn, scale) in zip(frames, cases, strict=True):
-        least = np.repeat([origin, turn, scale], [3, 3, 1]) ** 2
-        some = np.arange(REGISTRATION)
-        place[some, some] = np.maximum(place[some, some], least)
-    rates = np.array([rate for rate, *_ in cases])
-    many, first = len(cases), len(noise)
-    base = float(model.path_noise)
-    return Components(
-        np.concatenate(
-            [
-                log_of(rates),
-                np.full(first, float(log_of(prior.noise_rate / 2))),
-                usual.log_weight + float(np.log1p(-prior.doubt)),
-            ]
-        ),
-        np.concatenate([np.arange(many), np.full(first, many), usual.normal + many]),
-        np.zeros((many + usual.normals, layout.size)),
-        np.concatenate([frames, usual.covariance]),
-        np.concatenate([np.ones(many + first), usual.sigma]),
-        np.concatenate([np.full(many, base), noise, usual.noise_m]),
-        np.arange(many + first + len(usual)) < many,
-    )
+    found = [usual.weighted(1.0 - prior.doubt)]
+    for share in prior.noise:
+        noise = float(np.hypot(model.path_noise, share * reach))
+        noisy = Components.normal_of(usual.covariance[0], noise)
+        found.append(noisy.weighted(prior.noise_rate / 2))
+    for rate, origin, turn, scale in cases:
+        least = np.zeros(layout.size)
+        least[:REGISTRATION] = np.repeat([origin, turn, scale], [3, 3, 1]) ** 2
+        covariance = np.maximum(usual.covariance[0], np.diag(least))
+        moved = Components.normal_of(covariance, float(model.path_noise), displaced=True)
+        found.append(moved.weighted(rate))
+    return Components.joined([one for one in found if np.isfinite(one.log_weight).any()])
 
 
 def _broad(frames: Components, noise_m: float) -> Components:
@@ -155,9 +130,9 @@ def _about(
     frames = displaced_components(model, priors.setup, layout, usual)
     noise = float(np.hypot(model.path_noise, share * model.twin.robot.reach))
     ranked = [h for h in hypotheses if has_rows(h)]
-    broad = _broad(frames, noise)
+    broad = _broad(frames, noise).about(np.pad(place, ((0, 0), (0, layout.size - REGISTRATION))))
     settled = replace(likelihood, moving=None)
-    return _weighing(settled, ranked, priors, layout, broad, place)
+    return Weighing(settled, ranked, priors, layout, broad, place)
 
 
 def registered_each(
@@ -236,7 +211,8 @@ def _suspect(
     ill: BoolArray = np.zeros(len(best), dtype=bool)
     for h in np.unique(best).tolist():
         rows = np.flatnonzero(best == h)
-        some = _weighing(likelihood[rows], [hypotheses[h]], priors, layout, narrow, None)
+        place = np.zeros((len(rows), REGISTRATION))
+        some = Weighing(likelihood[rows], [hypotheses[h]], priors, layout, narrow, place)
         information[rows], shift[rows] = theta_factors(some.evidence)
         ill[rows] = misfit_of(some.evidence) > ILL_FITTING
     frames = displaced_components(likelihood.model, priors.setup, layout, usual)

@@ -11,10 +11,12 @@ Section: docs/inference.md#theta
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from failuretwin.core.numerics import log_of
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -89,12 +91,15 @@ class Components:
     displaced: BoolArray
 
     @classmethod
-    def normal_of(cls, covariance: FloatArray, noise_m: float) -> Components:
+    def normal_of(
+        cls, covariance: FloatArray, noise_m: float, displaced: bool = False
+    ) -> Components:
         """Return one normal distribution about 0 of a robot that scatters as its class.
 
         Args:
             covariance: V, (theta, theta).
             noise_m: Noise of the sensor [m].
+            displaced: Whether the sensor stands elsewhere than the profile says.
         """
         none = np.zeros(1)
         return cls(
@@ -104,7 +109,7 @@ class Components:
             covariance[None],
             np.ones(1),
             np.array([noise_m]),
-            np.zeros(1, dtype=bool),
+            np.array([displaced]),
         )
 
     def __len__(self) -> int:
@@ -131,6 +136,25 @@ class Components:
     def about(self, place: FloatArray) -> Components:
         """Return the same for runs that are expanded about some theta each, (run, theta)."""
         return replace(self, mean=self.mean - place[:, None])
+
+    def weighted(self, rate: float) -> Components:
+        """Return the same with a probability that one of them is true."""
+        return replace(self, log_weight=self.log_weight + float(log_of(rate)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Components]) -> Components:
+        """Return several beliefs as one; means are those of all runs or of each in all of them."""
+        begin = np.cumsum([0, *(one.normals for one in parts[:-1])])
+        normal = [one.normal + at for one, at in zip(parts, begin, strict=True)]
+        return cls(
+            np.concatenate([one.log_weight for one in parts], axis=-1),
+            np.concatenate(normal),
+            np.concatenate([one.mean for one in parts], axis=-2),
+            np.concatenate([one.covariance for one in parts], axis=-3),
+            np.concatenate([one.sigma for one in parts]),
+            np.concatenate([one.noise_m for one in parts]),
+            np.concatenate([one.displaced for one in parts]),
+        )
 
     def weight(self, run: IntArray, component: IntArray) -> FloatArray:
         """Return the log weight of some components in some runs, (pick,)."""
