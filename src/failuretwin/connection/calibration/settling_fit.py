@@ -28,8 +28,7 @@ from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.set_ups.setup_prior import SetupPrior
 from failuretwin.inference.theta.shared_belief import Belief
-from failuretwin.inference.theta.shared_unknowns import REGISTRATION, SharedLayout
-from failuretwin.inference.theta.shared_weighing import SharedWeighing
+from failuretwin.inference.theta.shared_unknowns import REGISTRATION, SharedLayout, components
 from failuretwin.inference.together.habits import Habits
 from failuretwin.inference.together.runs_together import RunsTogether
 
@@ -217,10 +216,11 @@ def fit_settling(observations: Observations) -> SettlingFit:
         evidence = replace(evidence, usable=known)
     likelihood = RunLikelihood(evidence, model)
     layout = SharedLayout(len(model.scatter), offsets=True)
-    weighing = SharedWeighing(likelihood, [HEALTHY], Priors(setup=SetupPrior.known()), layout)
-    told = weighing.parts
+    priors = Priors(setup=SetupPrior.known())
+    told = components(model, priors.setup, layout)
     unit = told[0].deviation
-    together = RunsTogether.of(weighing, Belief.of(told, unit), unit)
+    base = Belief.of(told, unit)
+    together = RunsTogether.of(likelihood, [HEALTHY], priors, base, unit)
     return fitted_to(observations, together)
 
 

@@ -10,13 +10,13 @@ Section: docs/inference.md#runs
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import Weighted, log_sum
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.picks import NarrowPart, Picks
@@ -164,6 +164,25 @@ class ThetaPart:
     weight: FloatArray
     mean: FloatArray
     covariance: FloatArray
+
+    def __getitem__(self, some: IntArray | BoolArray) -> ThetaPart:
+        """Return some of the picks."""
+        kept: IntArray = np.arange(len(self.places))[some]
+        arrays = (self.weight, self.mean, self.covariance)
+        rest = (array[kept] for array in arrays)
+        return ThetaPart(self.hypothesis, self.places[kept], self.picks[kept], *rest)
+
+    def of_components(self, which: BoolArray) -> ThetaPart:
+        """Return the picks by some components, (component,)."""
+        return self[which[self.picks.component]]
+
+    def above(self, least: float) -> ThetaPart:
+        """Return the picks that are more probable."""
+        return self[self.weight > least]
+
+    def scaled(self, factor: FloatArray) -> ThetaPart:
+        """Return the same with the weights of each run multiplied, (run,)."""
+        return replace(self, weight=self.weight * factor[self.picks.run])
 
 
 def theta_parts(evidence: RunsEvidence, least: float = LEAST_SHARE) -> list[ThetaPart]:

@@ -272,18 +272,21 @@ def displaced_evidence(
 def _about_the_better(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> tuple[list[Weighing], IntArray]:
-    """Return chunks of runs about 0, then about a registration, and which explains each run."""
+    """Return chunks of runs about their registrations, and which explains each run better."""
     runs = len(likelihood.usable)
-    if runs < FEW_RUNS:
-        place = registered_each(likelihood, hypotheses, priors)
-    else:
-        place = np.tile(registered_together(likelihood, hypotheses, priors), (runs, 1))
+    if runs >= FEW_RUNS:
+        places = [np.tile(registered_together(likelihood, hypotheses, priors), (runs, 1))]
+    else:  # one by itself may be registered wrongly
+        own = registered_each(likelihood, hypotheses, priors)
+        places = [own, np.zeros_like(own)]
     parts = [
         displaced_weighing(likelihood[rows], hypotheses, priors, where[rows])
-        for where in (np.zeros_like(place), place)
+        for where in places
         for rows in _chunks(runs)
     ]
-    total = np.concatenate([one.total for one in parts]).reshape(2, runs)
+    if len(places) == 1:
+        return parts, np.zeros(runs, dtype=np.int64)
+    total = np.concatenate([one.total for one in parts]).reshape(len(places), runs)
     return parts, np.argmax(total, axis=0)
 
 

@@ -110,12 +110,14 @@ class RunsEvidence:
         hypotheses: What may be the case; all of them have rows.
         components: What is believed of the robot.
         log_odds: Log prior of each hypothesis, (hypothesis,).
+        asked: Hypotheses that are weighed, (run, hypothesis); None: all.
     """
 
     scene: Scene
     hypotheses: Sequence[Hypothesis]
     components: Components
     log_odds: FloatArray
+    asked: BoolArray | None = None
 
     @cached_property
     def rows(self) -> list[Rows]:
@@ -215,7 +217,10 @@ class RunsEvidence:
         return NarrowPart(self.scene, self.rows[h], picks, self.components, self.narrowed[h])
 
     def _all_rows(self, h: int) -> Picks:
-        run, row = np.nonzero(np.isfinite(self.rows[h].log_prior))
+        possible = np.isfinite(self.rows[h].log_prior)
+        if self.asked is not None:
+            possible &= self.asked[:, h, None]
+        run, row = np.nonzero(possible)
         return Picks(run, row, np.zeros_like(row))
 
     def _narrowed(self, h: int, one: Weighed) -> Narrowed:

@@ -117,6 +117,11 @@ class Components:
         return len(self.sigma)
 
     @property
+    def usual(self) -> FloatArray:
+        """V of the first normal distribution, of the first run if they have their own."""
+        return self.covariance.reshape(-1, *self.covariance.shape[-2:])[0]
+
+    @property
     def first(self) -> Components:
         """The first one alone."""
         return Components.normal_of(self.covariance[0], float(self.noise_m[0]))

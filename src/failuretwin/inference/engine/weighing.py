@@ -20,7 +20,7 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.engine.moments import moments_of
 from failuretwin.inference.engine.posterior import (
     marginal_likelihoods as engine_likelihoods,
@@ -59,6 +59,7 @@ class Weighing:
         layout: Places in theta.
         components: What is believed of theta, beside the place of each run.
         place: Registration about which each run is expanded, (run, 7).
+        asked: Hypotheses with rows that are weighed, (run, hypothesis); None: all.
     """
 
     likelihood: RunLikelihood
@@ -67,6 +68,7 @@ class Weighing:
     layout: Layout
     components: Components
     place: FloatArray
+    asked: BoolArray | None = None
 
     @cached_property
     def log_odds(self) -> FloatArray:
@@ -88,10 +90,12 @@ class Weighing:
             moments_of(model, seen),
             self.priors,
             self.layout,
-            self.components.covariance[0],
+            self.components.usual,
         )
         hypotheses = [self.hypotheses[i] for i in self.with_rows]
-        return RunsEvidence(scene, hypotheses, self.components, self.log_odds[self.with_rows])
+        asked = None if self.asked is None else self.asked[:, self.with_rows]
+        odds = self.log_odds[self.with_rows]
+        return RunsEvidence(scene, hypotheses, self.components, odds, asked)
 
     @cached_property
     def best(self) -> tuple[IntArray, FloatArray]:
@@ -222,14 +226,26 @@ class Weighing:
     @property
     def odd_zeros(self) -> list[str]:
         """Which zero of each run is far off what such robots do; empty where none is."""
-        motors = self.layout.motors
-        zeros = slice(REGISTRATION, REGISTRATION + motors)
-        usual = np.sqrt(np.diag(self.components.covariance[0]))[zeros]
-        mean, covariance = theta_posterior(self.evidence)
-        deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, zeros]
-        sure = np.maximum(np.abs(mean[:, zeros]) - 2.0 * deviation, 0.0) / usual
-        robot = self.likelihood.model.twin.robot
-        return [odd_zero(robot, *pair) for pair in zip(mean[:, zeros], sure, strict=True)]
+        usual = np.sqrt(np.diag(self.components.usual))
+        return odd_zeros_of(self, usual, np.zeros(self.layout.size))
+
+
+def odd_zeros_of(weighing: Weighing, usual: FloatArray, given: FloatArray) -> list[str]:
+    """Return which zero of each run is far off what such robots do; empty where none is.
+
+    Args:
+        weighing: The runs.
+        usual: Deviation of theta among such robots, (theta,).
+        given: Theta about which the runs are expanded, (theta,).
+    """
+    motors = weighing.layout.motors
+    zeros = slice(REGISTRATION, REGISTRATION + motors)
+    mean, covariance = theta_posterior(weighing.evidence)
+    deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, zeros]
+    off = mean[:, zeros] + given[zeros]
+    sure = np.maximum(np.abs(off) - 2.0 * deviation, 0.0) / usual[zeros]
+    robot = weighing.likelihood.model.twin.robot
+    return [odd_zero(robot, *pair) for pair in zip(off, sure, strict=True)]
 
 
 def assembled(

@@ -14,20 +14,23 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
-from failuretwin.inference.engine.registration import sensor_in_doubt
+from failuretwin.inference.engine.registration import registered_together, sensor_in_doubt
+from failuretwin.inference.engine.weighing import odd_zeros_of
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.theta.shared_belief import Belief
 from failuretwin.inference.theta.shared_likelihood import Normal
-from failuretwin.inference.theta.shared_unknowns import REGISTRATION
-from failuretwin.inference.theta.shared_weighing import SharedWeighing
-from failuretwin.inference.together.runs_together import CHUNK_RUNS, RunsTogether
+from failuretwin.inference.theta.shared_unknowns import REGISTRATION, components, layout_of
+from failuretwin.inference.together.judged_runs import Judged
+from failuretwin.inference.together.runs_together import RunsTogether
 
 PASSES, MOST_PASSES, MOVED = 4, 12, 0.2
 """Times that every run is judged, and at most: until a pass moves theta by no more than this share
 of its deviation."""
+SAMPLED_RUNS = 32
+"""Runs that tell whether the sensor may be displaced."""
 DAMPING = 0.7
 """Share of a new site that is taken, from the second pass on."""
 Advance = Callable[[int], None]
@@ -88,7 +91,7 @@ def folder_posterior(
         priors: Beliefs about faults and set-ups.
         advance: Told of progress.
     """
-    together, usual = begun(SharedWeighing(likelihood, hypotheses, priors))
+    together, usual = begun(likelihood, hypotheses, priors)
     rows, moved, asked = np.arange(together.runs), np.inf, None
     for done in range(MOST_PASSES):
         last = done == MOST_PASSES - 1 or (done >= PASSES - 1 and moved <= MOVED)
@@ -107,40 +110,51 @@ def folder_posterior(
     mean, covariance = mean * unit, covariance * np.outer(unit, unit)
     place = mean.copy()
     place[REGISTRATION:] = 0.0
-    posteriors = [each.posterior() for each in found]
+    posteriors = [_posterior(each, together.here, usual) for each in found]
     at = together.at(mean)
     return FolderPosterior(at, place, mean, covariance, unit, usual, sites, taught, posteriors)
 
 
-def begun(weighing: SharedWeighing) -> tuple[RunsTogether, FloatArray]:
+def begun(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> tuple[RunsTogether, FloatArray]:
     """Return runs of which nothing was judged yet, and what others of their kind differ by.
 
     What arms of the kind are like is the prior of theta. The frame of the sensor is known; if the
     runs say that it may not be, it is known or anywhere near, by the odds of the set-up.
     """
-    told = [part for part in weighing.parts if not part.name]
+    parts = components(likelihood.model, priors.setup, layout_of(likelihood.model))
+    told = [part for part in parts if not part.name]
     usual = unit = told[0].deviation
-    in_doubt = doubted(weighing)
+    in_doubt = doubted(likelihood, hypotheses, priors)
     if in_doubt:
-        unit, odds = weighing.broad, weighing.priors.setup.doubt
+        unit, odds = np.maximum.reduce([part.deviation for part in parts]), priors.setup.doubt
         moved = float(np.log(odds) - np.log1p(-odds))
         told += [
             replace(p, log_weight=p.log_weight + moved, deviation=_in_doubt(p.deviation, unit))
             for p in told
         ]
-    together = RunsTogether.of(weighing, Belief.of(told, unit), unit)
+    together = RunsTogether.of(likelihood, hypotheses, priors, Belief.of(told, unit), unit)
     if in_doubt:
-        together.here = weighing.register_together()[0]
+        together.here[:REGISTRATION] = registered_together(likelihood, hypotheses, priors)
     return together, usual
 
 
-def doubted(weighing: SharedWeighing) -> bool:
-    """Return whether some of the runs, evenly spread, say that the set-up may be off."""
-    runs = len(weighing.nowhere)
-    some = np.unique(np.linspace(0, runs - 1, CHUNK_RUNS // 2).astype(np.int64))
-    return sensor_in_doubt(weighing.likelihood[some], weighing.hypotheses, weighing.priors)
+def doubted(likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors) -> bool:
+    """Return whether some of the runs, evenly spread, say that the sensor may be displaced."""
+    runs = len(likelihood.usable)
+    some = np.unique(np.linspace(0, runs - 1, SAMPLED_RUNS).astype(np.int64))
+    return sensor_in_doubt(likelihood[some], hypotheses, priors)
 
 
 def _in_doubt(deviation: FloatArray, broad: FloatArray) -> FloatArray:
     """Return the deviations of theta with a frame that may be anywhere near, (theta,)."""
     return np.concatenate([broad[:REGISTRATION], deviation[REGISTRATION:]])
+
+
+def _posterior(judged: Judged, here: FloatArray, usual: FloatArray) -> Posterior:
+    """Return the posterior of runs, with zeros that are odd by those of their kind."""
+    found = judged.weighing.posterior()
+    if len(usual) == REGISTRATION:
+        return replace(found, offsets=())
+    return replace(found, offsets=odd_zeros_of(judged.weighing, usual, here))

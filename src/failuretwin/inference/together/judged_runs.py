@@ -5,28 +5,25 @@ Section: docs/inference.md#folders
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.nonidealities import Imperfections, LostCommand
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.posterior import Posterior
-from failuretwin.inference.theta.scatter_score import told_of_scatter
+from failuretwin.inference.engine.posterior import ThetaPart, pooled, theta_factors, theta_parts
+from failuretwin.inference.engine.scatter import outcome_shares, scatter_information
+from failuretwin.inference.engine.weighing import Weighing
 from failuretwin.inference.theta.shared_belief import Belief
-from failuretwin.inference.theta.shared_likelihood import has_score
-from failuretwin.inference.theta.shared_posterior import Mixture
-from failuretwin.inference.theta.shared_weighing import Candidate, SharedWeighing
 from failuretwin.inference.together.habits import Habits
 
 LEAST_TOLD = 1e-3
 """What is less probable is not asked for scatter and losses."""
-
 LEAST_LIKELY = 1e-8
 """What is less probable is not weighed again before the last pass over the runs."""
 
@@ -37,40 +34,50 @@ class Judged:
 
     Attributes:
         rows: Which they are.
-        weighing: The runs.
+        weighing: The runs, about one theta.
         cavity: What was believed without them, in units.
-        candidates: What was found with each component of that.
-        log_evidence: Log of weight times evidence, (run, candidate, hypothesis).
-        loose: Whether the frame of the sensor is in doubt with each, (candidate,).
+        loose: Whether the frame of the sensor is in doubt in each component, (component,).
     """
 
     rows: IntArray
-    weighing: SharedWeighing
+    weighing: Weighing
     cavity: Belief
-    candidates: Sequence[Candidate]
-    log_evidence: FloatArray
     loose: BoolArray
 
     @property
-    def share(self) -> FloatArray:
-        """Probability of each hypothesis with each candidate, (run, candidate, hypothesis)."""
-        height = self.log_evidence + self.weighing.log_odds
-        return np.exp(height - log_sum(height, axis=(1, 2))[:, None, None])
+    def runs(self) -> int:
+        """How many they are."""
+        return len(self.rows)
 
     @property
     def likely(self) -> BoolArray:
         """Which hypotheses of each run may teach something, (run, hypothesis)."""
-        return np.asarray(self.share.sum(axis=1) > LEAST_LIKELY)
+        return np.asarray(self.weighing.share.sum(axis=1) > LEAST_LIKELY)
 
-    def posterior(self) -> Posterior:
-        """Return the posterior over hypotheses of each run."""
-        top = np.argmax(self.log_evidence, axis=1)[:, None]
-        first = np.arange(len(self.candidates))[None, :, None] == top
-        whole = log_sum(self.log_evidence, axis=1)[:, None]
-        table = np.where(first, whole, -np.inf)
-        return Mixture(self.weighing, self.candidates, table).posterior()
+    @cached_property
+    def parts(self) -> list[ThetaPart]:
+        """Theta under all that is probable, by hypothesis."""
+        return theta_parts(self.weighing.evidence)
 
-    def habits(self, given: Imperfections, covariance: FloatArray, at: FloatArray) -> Habits:
+    def moments(self, loose: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return theta if the frame of the sensor is in doubt, or if it is not.
+
+        Returns:
+            Probability of that (run,), mean (run, theta) and covariance (run, theta, theta).
+        """
+        which = self.loose == loose
+        some = [part.of_components(which) for part in self.parts]
+        weight = np.zeros(self.runs)
+        for part in some:
+            np.add.at(weight, part.picks.run, part.weight)
+        return weight, *pooled(some, self.runs)
+
+    @property
+    def factors(self) -> tuple[FloatArray, FloatArray]:
+        """What each run alone says of theta: Lambda (run, theta, theta) and eta (run, theta)."""
+        return theta_factors(self.weighing.evidence)
+
+    def habits(self, given: Imperfections) -> Habits:
         """Return what the runs say of scatter and losses, (run, ...); faulty motors left out.
 
         A motor that is held takes the others where healthy runs do not go, under loads that their
@@ -78,52 +85,52 @@ class Judged:
 
         Args:
             given: What was given of the robot.
-            covariance: Of theta under each hypothesis, (run, candidate, hypothesis, theta, theta).
-            at: Logarithms of scatter and tail that the runs were weighed with, (motor + 1,).
         """
-        habits, priors = Habits.none(len(self.rows), given), self.weighing.priors
-        for c, h, rows, share in self._telling():
-            hypothesis, found = self.weighing.hypotheses[h], self.candidates[c].found
-            response = found.expansion.response[rows]
-            told = told_of_scatter(response, hypothesis, priors, found.theta[rows, h])
+        habits, evidence = Habits.none(self.runs, given), self.weighing.evidence
+        for part in self._telling():
+            run, weight = part.picks.run, part.weight
+            hypothesis = evidence.hypotheses[part.hypothesis]
+            outcomes = outcome_shares(evidence, part)
             for i, entry in enumerate(given.lost_commands):
-                lost = self._losses(entry, hypothesis, rows, told.outcomes)
-                habits.losses[rows, i] += share[:, None, None] * lost
-            if _holds(hypothesis):
-                continue
-            slack = np.einsum("rntu,rtu->rn", told.slack, covariance[rows, c, h], optimize=True)
-            along = told.information @ at + told.score
-            along[:, :-1] += slack
-            habits.precision[rows] += share[:, None, None] * told.information
-            habits.shift[rows] += share[:, None] * along
+                lost = self._losses(entry, hypothesis, part, outcomes)
+                np.add.at(habits.losses[:, i], run, weight[:, None, None] * lost)
+            if not _holds(hypothesis):
+                told = scatter_information(evidence, part)
+                shift = told.information @ self._log_scatter(given) + told.score
+                np.add.at(habits.precision, run, weight[:, None, None] * told.information)
+                np.add.at(habits.shift, run, weight[:, None] * shift)
         return habits
 
-    def _telling(self) -> Iterator[tuple[int, int, IntArray, FloatArray]]:
-        """Yield candidate, hypothesis, runs and their shares, where these matter.
+    def _telling(self) -> Iterator[ThetaPart]:
+        """Yield theta where it is probable, by hypothesis; the weights of a run sum to 1."""
+        kept = [part.above(LEAST_TOLD) for part in self.parts]
+        total = np.full(self.runs, 1e-300)
+        for part in kept:
+            np.add.at(total, part.picks.run, part.weight)
+        for part in kept:
+            yield part.scaled(1.0 / total)
 
-        What has no score of its own tells as the most probable that has.
-        """
-        scored = np.array([has_score(h) for h in self.weighing.hypotheses])
-        share = np.where(scored, self.share, 0.0)
-        best = share.reshape(len(share), -1).argmax(axis=1)
-        share.reshape(len(share), -1)[np.arange(len(share)), best] += 1.0 - share.sum(axis=(1, 2))
-        for c, h in np.argwhere((share > LEAST_TOLD).any(axis=0)):
-            rows = np.flatnonzero(share[:, c, h] > LEAST_TOLD)
-            yield int(c), int(h), rows, share[rows, c, h]
+    def _log_scatter(self, given: Imperfections) -> FloatArray:
+        """Return logarithms of scatter and tail beside those given, (motor + 1,)."""
+        now, before = self.weighing.likelihood.model.settling, given.settling
+        assert before is not None
+        tail = np.log(now.tail_dof / before.tail_dof) if np.isfinite(before.tail_dof) else 0.0
+        return np.append(np.log(np.divide(now.scatter, before.scatter)), tail)
 
     def _losses(
-        self, entry: LostCommand, hypothesis: Hypothesis, rows: IntArray, outcomes: FloatArray
+        self, entry: LostCommand, hypothesis: Hypothesis, part: ThetaPart, outcomes: FloatArray
     ) -> FloatArray:
-        """Return how often some motors lose a command, punctual and late, (run, 2, 2)."""
-        names, late = self.weighing.likelihood.model.motor_names, self.weighing.likelihood.late
+        """Return how often some motors lose a command, punctual and late, (pick, 2, 2)."""
+        likelihood, run = self.weighing.likelihood, part.picks.run
+        names, late = likelihood.model.motor_names, likelihood.late
         lost = np.isin(names, entry.motors)
         faulty = np.isin(names, [fault.motor for fault in hypothesis.faults])
-        told = np.zeros((len(rows), 2, 2))
+        told = np.zeros((len(run), 2, 2))
         if (lost & faulty).any():
             return told
-        patterns = self.candidates[0].found.expansion.response.usual.lost
+        patterns = self.weighing.evidence.scene.model.lost_commands.lost
         hit = (patterns[:, ~faulty] == lost[~faulty]).all(axis=1)
-        for k, kind in enumerate((1.0 - late[rows], late[rows])):
+        for k, kind in enumerate((1.0 - late[run], late[run])):
             told[:, k, 0] = (outcomes[..., hit].sum(axis=-1) * kind).sum(axis=1)
             told[:, k, 1] = (outcomes.sum(axis=-1) * kind).sum(axis=1)
         return told

@@ -22,7 +22,7 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections
-from failuretwin.inference.engine.registration import sensor_in_doubt
+from failuretwin.inference.engine.registration import registered_together, sensor_in_doubt
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import SettledEvidence, TransientSamples
@@ -30,8 +30,13 @@ from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.theta.shared_belief import Belief, summed
 from failuretwin.inference.theta.shared_likelihood import Normal
-from failuretwin.inference.theta.shared_unknowns import REGISTRATION, SharedLayout, layout_of
-from failuretwin.inference.theta.shared_weighing import SharedWeighing
+from failuretwin.inference.theta.shared_unknowns import (
+    REGISTRATION,
+    SharedComponent,
+    SharedLayout,
+    components,
+    layout_of,
+)
 from failuretwin.inference.together.folder_posterior import FolderPosterior
 from failuretwin.inference.together.habits import Habits
 from failuretwin.inference.together.runs_together import RunsTogether
@@ -123,11 +128,7 @@ class LifeFilter:
             priors: Beliefs about faults and set-ups.
             limits: How fast and how far it may change.
         """
-        motors = len(model.scatter)
-        runs = SettledEvidence.empty(run=0, movement=1, motor=motors, axis=3)
-        layout = SharedLayout(motors, offsets=True)
-        weighing = SharedWeighing(RunLikelihood(runs, model), hypotheses, priors, layout)
-        told = [part for part in weighing.parts if not part.name]
+        told = [part for part in _components(model, priors) if not part.name]
         unit = told[0].deviation
         learns = layout_of(model).offsets and model.imperfections.settling is not None
         habits = Habits.believed(model.imperfections) if learns else None
@@ -166,7 +167,7 @@ class LifeFilter:
             window.counted[:] = False
             window.maximise()
         self.window = self._without_oldest(window)
-        return found.posterior()
+        return found.weighing.posterior()
 
     @property
     def belief(self) -> Belief:
@@ -306,9 +307,7 @@ class LifeFilter:
 
     def _together(self, evidence: SettledEvidence) -> RunsTogether:
         likelihood = RunLikelihood(evidence, self.model)
-        layout = SharedLayout(len(self.model.scatter), offsets=True)
-        weighing = SharedWeighing(likelihood, self.hypotheses, self.priors, layout)
-        found = RunsTogether.of(weighing, self.base, self.unit)
+        found = RunsTogether.of(likelihood, self.hypotheses, self.priors, self.base, self.unit)
         found.habits = self.habits
         found.here = self.base.moments[0][0] * self.unit
         found.maximise()
@@ -357,14 +356,16 @@ class LifeFilter:
 
     def _look_for_sensor(self, window: RunsTogether) -> None:
         """Let the frame of the sensor be anywhere near, and judge the latest runs anew."""
-        weighing = SharedWeighing(window.given, self.hypotheses, self.priors, window.layout)
-        variance = (weighing.broad / self.unit) ** 2
+        parts = _components(self.model, self.priors)
+        broad = np.maximum.reduce([part.deviation for part in parts])
+        variance = (broad / self.unit) ** 2
         variance[REGISTRATION:] = 0.0
         odds = self.priors.setup.doubt / (1.0 - self.priors.setup.doubt)
         self.moved, self.base = True, self.base.or_moved(variance, odds)
         window.base = self.base
         window.sites.precision[:], window.sites.shift[:] = 0.0, 0.0
-        window.here = weighing.register_together()[0]
+        there = registered_together(window.given, self.hypotheses, self.priors)
+        window.here = np.concatenate([there, np.zeros(len(self.unit) - REGISTRATION)])
 
     # What changes as no wear does.
 
@@ -414,6 +415,11 @@ class LifeFilter:
         of_each = np.maximum(spread / self.unit[free], LEAST_SPREAD)
         precision[loose, loose] = of_each**-2.0
         return Belief(np.zeros((1, 1)), precision[None, None], (precision @ mean)[None, None])
+
+
+def _components(model: HealthyModel, priors: Priors) -> list[SharedComponent]:
+    """Return what is believed of theta, offsets among it; the first: that all is well."""
+    return components(model, priors.setup, SharedLayout(len(model.scatter), offsets=True))
 
 
 def _state(belief: Belief, unit: FloatArray) -> FloatArray:
