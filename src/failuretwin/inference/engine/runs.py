@@ -259,6 +259,7 @@ class RunsEvidence:
         asked = np.zeros(says.shape, dtype=bool)
         asked[:, healthy] = True
         asked[np.arange(runs), others.argmax(axis=1)] = True
+        asked &= np.isfinite(says)
         table = np.full((runs, count, len(first)), -np.inf)
         for h in np.flatnonzero(asked.any(axis=0)).tolist():
             some = np.repeat(np.flatnonzero(asked[:, h]), count)
