@@ -31,6 +31,9 @@ PASSES, MOST_PASSES, MOVED = 4, 12, 0.2
 of its deviation."""
 SAMPLED_RUNS = 32
 """Runs that tell whether the sensor may be displaced."""
+AS_HEALTHY, COARSE = 2, 0.004
+"""First passes, in which every run counts as healthy, and noise of the sensor in the very first, as
+a share of the reach: what all runs share must not look like a fault of each."""
 DAMPING = 0.7
 """Share of a new site that is taken, from the second pass on."""
 Advance = Callable[[int], None]
@@ -92,14 +95,20 @@ def folder_posterior(
         advance: Told of progress.
     """
     together, usual = begun(likelihood, hypotheses, priors)
-    rows, moved, asked = np.arange(together.runs), np.inf, None
+    rows, moved, likely = np.arange(together.runs), np.inf, None
+    healthy = np.tile([h.is_healthy for h in hypotheses], (together.runs, 1))
     for done in range(MOST_PASSES):
         last = done == MOST_PASSES - 1 or (done >= PASSES - 1 and moved <= MOVED)
-        found = together.judge(rows, asked=None if last else asked)
+        as_healthy = done < AS_HEALTHY and bool(healthy.any()) and not last
+        asked = None if last else healthy if as_healthy else likely
+        noise = COARSE * likelihood.model.twin.robot.reach if done == 0 else 0.0
+        found = together.judge(rows, asked=asked, noise_m=noise)
         advance(int(done < PASSES))
         if last:
             break
-        before, asked = together.here, np.concatenate([each.likely for each in found])
+        before = together.here
+        if not as_healthy:
+            likely = np.concatenate([each.likely for each in found])
         together.learn(found, 1.0 if done == 0 else DAMPING)
         (_,), (covariance,) = together.belief.moments
         spread = together.unit * np.sqrt(np.diag(covariance))

@@ -147,7 +147,11 @@ class RunsTogether:
         )
 
     def judge(
-        self, rows: IntArray, moving: TransientSamples | None = None, asked: BoolArray | None = None
+        self,
+        rows: IntArray,
+        moving: TransientSamples | None = None,
+        asked: BoolArray | None = None,
+        noise_m: float = 0.0,
     ) -> list[Judged]:
         """Return what some runs say, each with its cavity; so many at a time as fit.
 
@@ -155,12 +159,14 @@ class RunsTogether:
             rows: The runs.
             moving: Their readings on the way; None: they are left aside.
             asked: Hypotheses that are weighed, (of these runs, hypothesis); None: all.
+            noise_m: Noise of the sensor beside what is known [m].
         """
         return [
             self._judge(
                 rows[p],
                 None if moving is None else moving[p],
                 None if asked is None else asked[p],
+                noise_m,
             )
             for p in np.split(np.arange(len(rows)), np.arange(CHUNK_RUNS, len(rows), CHUNK_RUNS))
         ]
@@ -214,7 +220,11 @@ class RunsTogether:
         return self.base.times(Normal(precision, shift))
 
     def _judge(
-        self, rows: IntArray, moving: TransientSamples | None, asked: BoolArray | None
+        self,
+        rows: IntArray,
+        moving: TransientSamples | None,
+        asked: BoolArray | None,
+        noise_m: float,
     ) -> Judged:
         cavity, model = self._cavity(rows), self.at(self.here)
         some = np.flatnonzero((cavity.weight > LEAST_SHARE).any(axis=0))
@@ -224,18 +234,18 @@ class RunsTogether:
             self.hypotheses,
             self.priors,
             Layout(len(model.scatter), geometry=False),
-            self._components(used, model),
+            self._components(used, float(np.hypot(model.path_noise, noise_m))),
             np.tile(self.here[:REGISTRATION], (len(rows), 1)),
             asked,
         )
         return Judged(rows, weighing, used, self._loose[some])
 
-    def _components(self, belief: Belief, model: HealthyModel) -> Components:
+    def _components(self, belief: Belief, noise_m: float) -> Components:
         """Return beliefs of each run about where runs are expanded, no longer in units."""
         covariance: FloatArray = np.asarray(np.linalg.inv(belief.precision))
         mean = np.einsum("rctu,rcu->rct", covariance, belief.shift) * self.unit - self.here
         covariance = np.asarray(covariance * np.outer(self.unit, self.unit))
-        known, size = 3 * len(model.scatter) + REGISTRATION, len(self.unit)
+        known, size = 3 * len(self.model.scatter) + REGISTRATION, len(self.unit)
         if size < known:  # offsets that are known
             rest = known - size
             mean = np.pad(mean, ((0, 0), (0, 0), (0, rest)))
@@ -249,7 +259,7 @@ class RunsTogether:
             mean,
             covariance,
             np.ones(count),
-            np.full(count, model.path_noise),
+            np.full(count, noise_m),
             np.zeros(count, dtype=bool),
         )
 
