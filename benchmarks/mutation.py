@@ -81,23 +81,13 @@ AREAS: dict[str, tuple[str, ...]] = {
     ),
     "inference/explanation.py": ("tests/decision/test_wording.py",),
     "inference/theta/shared_unknowns.py": ("tests/decision/test_shared_unknowns.py",),
-    "inference/theta/linear_response.py": (
-        "tests/decision/test_linear_response.py",
-        "tests/decision/test_shared_likelihood.py",
-    ),
-    "inference/theta/scatter_score.py": (
-        "tests/decision/test_shared_likelihood.py",
+    "inference/engine/scatter.py": (
+        "tests/connection/test_life_filter.py",
         "tests/decision/test_folder_posterior.py",
     ),
-    "inference/theta/shared_likelihood.py": (
-        "tests/decision/test_shared_likelihood.py",
-        "tests/decision/test_folder_posterior.py",
-    ),
+    "inference/engine/registration.py": ("tests/decision/test_shared_posterior.py",),
+    "inference/engine/weighing.py": ("tests/decision/test_shared_posterior.py",),
     "inference/theta/shared_posterior.py": ("tests/decision/test_shared_posterior.py",),
-    "inference/theta/shared_weighing.py": (
-        "tests/decision/test_shared_posterior.py",
-        "tests/decision/test_shared_likelihood.py",
-    ),
     "inference/together/folder_posterior.py": ("tests/decision/test_folder_posterior.py",),
     "inference/theta/shared_belief.py": (
         "tests/decision/test_folder_posterior.py",

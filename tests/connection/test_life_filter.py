@@ -10,7 +10,6 @@ from worn_robot import (
     CALIBRATION,
     COUNT,
     DOUBT,
-    KNOWN,
     MOVEMENTS,
     NOISE_M,
     SETTLING,
@@ -21,14 +20,17 @@ from worn_robot import (
     truth,
 )
 
-from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.engine.posterior import theta_parts
+from failuretwin.inference.engine.scatter import scatter_information
+from failuretwin.inference.engine.theta import Components, Layout
+from failuretwin.inference.engine.weighing import Weighing
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.theta.linear_response import LinearResponse
-from failuretwin.inference.theta.scatter_score import told_of_scatter
-from failuretwin.inference.theta.shared_belief import Belief
-from failuretwin.inference.theta.shared_likelihood import Normal, local_likelihood
-from failuretwin.inference.theta.shared_unknowns import SharedComponent, SharedLayout
+from failuretwin.inference.theta.shared_belief import Belief, Normal
+from failuretwin.inference.theta.shared_unknowns import SharedComponent
 from failuretwin.inference.together.life_filter import CHANCE, MOST_DOUBT, WINDOW
 from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
 
@@ -105,9 +107,14 @@ def said_of_scatter(robot, evidence, factor=1.0, motor=0):
     settling = replace(SETTLING, scatter=tuple(scatter), tail_dof=dof)
     sharp = replace(CALIBRATION, settling=settling, variation=None)
     model = HealthyModel(DigitalTwin(robot), sharp)
-    response = LinearResponse.of(evidence, model, SharedLayout(4, offsets=True), range(4))
-    place = (response, Hypothesis.parse("healthy"), KNOWN, np.zeros((len(evidence.usable), 19)))
-    return local_likelihood(*place).log_likelihood, told_of_scatter(*place).score
+    likelihood, layout = RunLikelihood(evidence, model), Layout(4, geometry=False)
+    known = Components.normal_of(np.diag(np.full(layout.size, 1e-12)), model.path_noise)
+    place = np.zeros((len(evidence.usable), 7))
+    weighing = Weighing(likelihood, [HEALTHY], Priors(), layout, known, place)
+    (part,) = theta_parts(weighing.evidence)
+    order = np.argsort(part.picks.run)
+    score = scatter_information(weighing.evidence, part).score[order]
+    return weighing.evidence.by_hypothesis[:, 0], score
 
 
 @pytest.mark.parametrize("motor", [0, 1, 3, 4])

@@ -14,7 +14,6 @@ from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.theta.linear_response import LinearResponse
 from failuretwin.inference.theta.shared_unknowns import (
     SharedLayout,
     offsets_of,
@@ -42,9 +41,6 @@ class Scene:
     evidence: SettledEvidence
     model: HealthyModel
     hypothesis: Hypothesis
-
-    def response(self, layout=WHOLE):
-        return LinearResponse.of(self.evidence, self.model, layout, range(layout.motors))
 
 
 def scene(twin, name, runs=2, dof=np.inf, lost=(), count=6, seed=3, doubt=DOUBT):

@@ -33,9 +33,9 @@ from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.theta.shared_likelihood import has_score
 from failuretwin.inference.together.life_filter import LifeFilter
 from failuretwin.inference.together.mixed_runs import of_second_robot, two_robots
 from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
@@ -93,7 +93,7 @@ def begin(diagnoser: BayesDiagnoser, cold: bool, limits: WearLimits | None = Non
             "track. Give a calibration (`failuretwin calibrate`), or none to begin cold."
         )
     hypotheses = diagnoser.hypothesis_set
-    if not any(has_score(hypothesis) for hypothesis in hypotheses):
+    if not any(has_rows(hypothesis) for hypothesis in hypotheses):
         raise InputError(
             "no hypothesis says where motors settle, so nothing can be learned. Add `healthy` or a "
             "motor that is stuck or misses its targets."

@@ -20,10 +20,10 @@ from failuretwin.inference.engine.integral import inverse
 from failuretwin.inference.engine.moments import moments_of
 from failuretwin.inference.engine.picks import Part, Picks
 from failuretwin.inference.engine.posterior import marginal_likelihoods, theta_posterior
+from failuretwin.inference.engine.registration import robot_posterior
 from failuretwin.inference.engine.rows import Scene
 from failuretwin.inference.engine.runs import RunsEvidence, has_rows
 from failuretwin.inference.engine.theta import layout_of, robot_components
-from failuretwin.inference.engine.unknown_robots import unknown_robot_posterior
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -255,9 +255,9 @@ def test_unknown_robots_in_chunks_say_what_they_say_alone():
     made = simulate(Plan(robot, ["healthy", "motor_2:stuck"], 9, 3, imperfections=imperfections))
     settled = Evidence(made, model.settings, model.sensors).sound.settled
     hypotheses = [Hypothesis.parse(name) for name in ("healthy", "motor_2:stuck")]
-    together = unknown_robot_posterior(RunLikelihood(settled, model), hypotheses, ft.Priors())
+    together = robot_posterior(RunLikelihood(settled, model), hypotheses, ft.Priors())
     some = slice(16, 18)
-    alone = unknown_robot_posterior(RunLikelihood(settled[some], model), hypotheses, ft.Priors())
+    alone = robot_posterior(RunLikelihood(settled[some], model), hypotheses, ft.Priors())
     assert together.log_posterior[some] == pytest.approx(alone.log_posterior, abs=1e-6)
     told = together.weights[1].estimate(17).onset
     again = alone.weights[1].estimate(1).onset

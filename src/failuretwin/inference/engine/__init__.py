@@ -12,9 +12,11 @@ Read in this order; each module states its term:
     rows           what is discrete of a hypothesis; amount_rows, redrawn_rows: by signature
     picks, runs    rows by components of the robot: the evidence of every hypothesis
     posterior      what is left of onset, size and theta
-    unknown_robots the posterior of runs of a robot that nobody has calibrated
+    weighing       all hypotheses by runs whose theta is a mixture of normal distributions
+    registration   runs of a robot that nobody has calibrated, or whose sensor may be displaced
+    scatter        what moments say of how far motors scatter
 
-It weighs rests of single runs: healthy, held, constant, growing and redrawn faults, of robots that
-are calibrated or not. `BayesDiagnoser` still weighs runs by `movements`, `faults` and `theta`; the
-engine takes their place question by question (docs/inference.md#engine).
+Healthy, held, constant, growing and redrawn faults have rows. Faults of the way, pairs and unknown
+ones are weighed at the most probable theta. Runs of calibrated robots are weighed by `movements`
+and `faults`, where theta is known.
 """

@@ -20,13 +20,29 @@ import numpy as np
 
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.theta.shared_likelihood import Normal
 from failuretwin.inference.theta.shared_unknowns import SharedComponent
 
 LEAST_PRECISION = 1e-9
 """Of a belief without some of its sites, in units of the prior's."""
 LEAST_WEIGHT = 1e-8
 """Components that are less probable are forgotten for good."""
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal distributions of theta, one a run, by precision and precision times mean.
+
+    Attributes:
+        precision: (run, theta, theta).
+        shift: Precision times mean, (run, theta).
+    """
+
+    precision: FloatArray
+    shift: FloatArray
+
+    def __getitem__(self, rows: IntArray) -> Normal:
+        """Return those of some of the runs."""
+        return Normal(self.precision[rows], self.shift[rows])
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
-from failuretwin.inference.theta.shared_belief import Belief
-from failuretwin.inference.theta.shared_likelihood import Normal
+from failuretwin.inference.theta.shared_belief import Belief, Normal
 from failuretwin.inference.theta.shared_unknowns import REGISTRATION, components, layout_of
 from failuretwin.inference.together.judged_runs import Judged
 from failuretwin.inference.together.runs_together import RunsTogether

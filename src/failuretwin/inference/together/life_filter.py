@@ -28,8 +28,7 @@ from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import SettledEvidence, TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
-from failuretwin.inference.theta.shared_belief import Belief, summed
-from failuretwin.inference.theta.shared_likelihood import Normal
+from failuretwin.inference.theta.shared_belief import Belief, Normal, summed
 from failuretwin.inference.theta.shared_unknowns import (
     REGISTRATION,
     SharedComponent,

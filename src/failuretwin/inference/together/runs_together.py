@@ -29,8 +29,7 @@ from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.theta.shared_belief import Belief, summed
-from failuretwin.inference.theta.shared_likelihood import Normal
+from failuretwin.inference.theta.shared_belief import Belief, Normal, summed
 from failuretwin.inference.theta.shared_unknowns import REGISTRATION, offsets_of
 from failuretwin.inference.together.habits import Habits
 from failuretwin.inference.together.judged_runs import Judged
