@@ -90,9 +90,9 @@ def test_order_does_not_matter(twin, mixed, found):
     order = np.random.default_rng(0).permutation(8)
     theta, log_posterior, _ = judged(twin, mixed.isel(run=order))
     known, expected, _ = found
-    np.testing.assert_allclose(np.exp(log_posterior), np.exp(expected[order]), atol=1e-4)
-    np.testing.assert_allclose(theta.mean / WIDTH, known.mean / WIDTH, atol=1e-4)
-    np.testing.assert_allclose(theta.taught, known.taught[order], atol=1e-4)
+    np.testing.assert_allclose(np.exp(log_posterior), np.exp(expected[order]), atol=1e-3)
+    np.testing.assert_allclose(theta.mean / WIDTH, known.mean / WIDTH, atol=3e-3)
+    np.testing.assert_allclose(theta.taught, known.taught[order], atol=3e-3)
 
 
 def test_nor_does_how_many_are_weighed_at_a_time(twin, mixed, found, monkeypatch):
@@ -101,8 +101,8 @@ def test_nor_does_how_many_are_weighed_at_a_time(twin, mixed, found, monkeypatch
     monkeypatch.undo()
     whole_set, expected, _ = judged(twin, mixed, priors=SURE)
     assert len(theta.posteriors) == 3
-    np.testing.assert_allclose(np.exp(log_posterior), np.exp(expected), atol=1e-4)
-    np.testing.assert_allclose(theta.mean / WIDTH, whole_set.mean / WIDTH, atol=1e-4)
+    np.testing.assert_allclose(np.exp(log_posterior), np.exp(expected), atol=1e-3)
+    np.testing.assert_allclose(theta.mean / WIDTH, whole_set.mean / WIDTH, atol=3e-3)
 
 
 def test_later_passes_change_nothing_that_matters(twin, mixed, found, monkeypatch):
@@ -116,18 +116,19 @@ def test_later_passes_change_nothing_that_matters(twin, mixed, found, monkeypatc
 def test_early_ones_do(twin, mixed, monkeypatch):
     """Normal are wide until it is known which motor is faulty; a second look narrows them."""
     found = {}
-    for passes in (2, 4, 10):
+    for passes in (3, 6, 12):
         monkeypatch.setattr(folder, "PASSES", passes)
         monkeypatch.setattr(folder, "MOST_PASSES", passes)
         found[passes], *_ = judged(twin, mixed, priors=SURE)
-    off = {n: np.abs((found[n].mean - found[10].mean) / found[10].deviation)[7:] for n in (2, 4)}
-    assert off[4].max() < 0.2
-    assert off[2].max() > off[4].max()
+    off = {n: np.abs((found[n].mean - found[12].mean) / found[12].deviation)[7:] for n in (3, 6)}
+    assert off[6].max() < 0.2
+    assert off[3].max() > off[6].max()
 
 
 def test_one_run_alone_is_judged_with_the_prior(twin, mixed, monkeypatch):
     """What it says itself of the robot does not count for its own hypothesis a second time."""
     monkeypatch.setattr(habits, "SCATTER_SPREAD", 1e-6)
+    monkeypatch.setattr(habits, "TAIL_SPREAD", 1e-6)
     for run in range(0, 8, 2):  # one of each truth
         alone = mixed.isel(run=[run])
         theta, log_posterior, names = judged(twin, alone, priors=SURE)

@@ -60,6 +60,7 @@ class Weighing:
         components: What is believed of theta, beside the place of each run.
         place: Registration about which each run is expanded, (run, 7).
         asked: Hypotheses with rows that are weighed, (run, hypothesis); None: all.
+        spread: V by which rows are centred, (theta, theta); None: that of the first component.
     """
 
     likelihood: RunLikelihood
@@ -69,6 +70,7 @@ class Weighing:
     components: Components
     place: FloatArray
     asked: BoolArray | None = None
+    spread: FloatArray | None = None
 
     @cached_property
     def log_odds(self) -> FloatArray:
@@ -90,7 +92,7 @@ class Weighing:
             moments_of(model, seen),
             self.priors,
             self.layout,
-            self.components.usual,
+            self.components.usual if self.spread is None else self.spread,
         )
         hypotheses = [self.hypotheses[i] for i in self.with_rows]
         asked = None if self.asked is None else self.asked[:, self.with_rows]

@@ -25,7 +25,7 @@ from failuretwin.inference.theta.shared_unknowns import REGISTRATION, components
 from failuretwin.inference.together.judged_runs import Judged
 from failuretwin.inference.together.runs_together import RunsTogether
 
-PASSES, MOST_PASSES, MOVED = 4, 12, 0.2
+PASSES, MOST_PASSES, MOVED = 6, 12, 0.2
 """Times that every run is judged, and at most: until a pass moves theta by no more than this share
 of its deviation."""
 SAMPLED_RUNS = 32

@@ -236,6 +236,7 @@ class RunsTogether:
             self._components(used, float(np.hypot(model.path_noise, noise_m))),
             np.tile(self.here[:REGISTRATION], (len(rows), 1)),
             asked,
+            self._in_full(self.belief.moments[1] * np.outer(self.unit, self.unit))[0],
         )
         return Judged(rows, weighing, used, self._loose[some])
 
@@ -244,13 +245,8 @@ class RunsTogether:
         covariance: FloatArray = np.asarray(np.linalg.inv(belief.precision))
         mean = np.einsum("rctu,rcu->rct", covariance, belief.shift) * self.unit - self.here
         covariance = np.asarray(covariance * np.outer(self.unit, self.unit))
-        known, size = 3 * len(self.model.scatter) + REGISTRATION, len(self.unit)
-        if size < known:  # offsets that are known
-            rest = known - size
-            mean = np.pad(mean, ((0, 0), (0, 0), (0, rest)))
-            covariance = np.pad(covariance, ((0, 0), (0, 0), (0, rest), (0, rest)))
-            some = np.arange(size, known)
-            covariance[..., some, some] = KNOWN**2
+        covariance = self._in_full(covariance)
+        mean = np.pad(mean, ((0, 0), (0, 0), (0, covariance.shape[-1] - len(self.unit))))
         count = mean.shape[1]
         return Components(
             belief.log_weight,
@@ -261,6 +257,14 @@ class RunsTogether:
             np.full(count, noise_m),
             np.zeros(count, dtype=bool),
         )
+
+    def _in_full(self, covariance: FloatArray) -> FloatArray:
+        """Return covariances (..., theta, theta) with known offsets where theta has none."""
+        size, whole = len(self.unit), REGISTRATION + 3 * len(self.model.scatter)
+        found = np.zeros((*covariance.shape[:-2], whole, whole))
+        found[..., np.arange(whole), np.arange(whole)] = KNOWN**2
+        found[..., :size, :size] = covariance
+        return found
 
     @property
     def _loose(self) -> BoolArray:
