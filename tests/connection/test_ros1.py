@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from failuretwin.connection.links import ros_link, ros_messages
-from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, EventQueue, Reading
+from failuretwin.connection.links import ros_messages
+from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, Reading
 from failuretwin.connection.links.ros1 import Ros1Transport
 from failuretwin.connection.links.ros_link import RosSink, RosSource
 from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosWriter
@@ -153,18 +153,17 @@ def test_ten_times_the_rate_is_taken(armpi, roscore):
 
 
 def test_a_consumer_that_sleeps_loses_readings_but_no_command(monkeypatch, armpi, roscore):
-    queue = EventQueue(capacity=50)
-    monkeypatch.setattr(ros_link, "EventQueue", lambda: queue)
     topics = RosTopics()
     with Ros1Transport() as transport:
         source = RosSource(armpi, topics, transport)
+        monkeypatch.setattr(source, "_capacity", 50)
         sink = RosSink(RosWriter(armpi, topics), transport)
         wait_until_connected(source, sink)
         sink.put(CommandSent(1.0, np.full(4, 0.1), np.ones(4)))
         for k in range(300):
             sink.put(reading(1000.0 + k))
             time.sleep(0.002)
-        wait_for(lambda: queue.dropped > 200)
+        wait_for(lambda: source.counts.dropped > 200)
         kept = [source.poll(0.1) for _ in range(50)]
     assert sum(isinstance(event, CommandSent) for event in kept) == 1
     assert sum(isinstance(event, Reading) for event in kept) == 49
@@ -271,7 +270,7 @@ rospy = load_rospy()
 import numpy
 print(rospy.__file__)
 print(numpy.__file__)
-print(*(importlib.util.find_spec(name) is None for name in ("apt", "gi", "catkin_pkg")))
+print(*(importlib.util.find_spec(name) is None for name in ("apt", "gi", "genpy")))
 """
     rospy, numpy, *hidden = run(code)
     assert rospy.startswith("/usr/lib/python3/dist-packages/")

@@ -6,6 +6,7 @@ Networks are named as on the command line: ``ros1``, ``ros2``, ``rosbridge://HOS
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import partial
 from threading import Lock
 from urllib.parse import urlsplit
@@ -13,12 +14,12 @@ from urllib.parse import urlsplit
 from failuretwin.connection.links.base import (
     CommandSent,
     Event,
-    EventQueue,
     Item,
+    Link,
     LinkCounts,
-    NothingToClose,
     Order,
     Reading,
+    Sink,
 )
 from failuretwin.connection.links.ros1 import Ros1Transport
 from failuretwin.connection.links.ros2 import ROUTER_PORT, Ros2Transport
@@ -51,16 +52,12 @@ def open_transport(text: str) -> Transport:
     if text == ROS2:
         return Ros2Transport()
     if text.startswith(f"{ROS2}://"):
-        return Ros2Transport(*address_of(text, ROUTER_PORT))
-    return RosbridgeTransport(*address_of(text, BRIDGE_PORT))
+        return Ros2Transport(*_address(text, ROUTER_PORT))
+    return RosbridgeTransport(*_address(text, BRIDGE_PORT))
 
 
-def address_of(text: str, usual_port: int) -> tuple[str, int]:
-    """Return host and port of an address such as ``rosbridge://HOST[:PORT]``.
-
-    Raises:
-        InputError: If it is not an address.
-    """
+def _address(text: str, usual_port: int) -> tuple[str, int]:
+    """Return host and port of an address such as ``rosbridge://HOST[:PORT]``."""
     try:
         address = urlsplit(text)
         host, port = address.hostname, address.port or usual_port
@@ -72,11 +69,8 @@ def address_of(text: str, usual_port: int) -> tuple[str, int]:
     return host, port
 
 
-# Links.
-
-
-class RosSource(NothingToClose):
-    """Source of readings and commands on a ROS network; it does not close the transport.
+class RosSource(Link):
+    """Readings and commands on a ROS network; it does not close the transport.
 
     Invalid messages are counted and left out.
 
@@ -89,15 +83,11 @@ class RosSource(NothingToClose):
         InputError: If messages hold servo counts and the robot's profile has none.
     """
 
-    ended = False
-
     def __init__(self, robot: Robot, topics: RosTopics, transport: Transport) -> None:
         topics.check_fits(robot)
-        self.name = f"{transport.name}: {', '.join(name for _, name, _ in topics.subscribed)}"
+        super().__init__(f"{transport.name}: {', '.join(name for _, name, _ in topics.subscribed)}")
         self._transport = transport
-        self._queue = EventQueue()
-        self._lock = Lock()
-        self._garbage, self._last_garbage = 0, ""
+        self._one_by_one = Lock()
         for role, topic, type_ in topics.subscribed:
             reader = RosReader(robot, role, topics)
             transport.subscribe(topic, type_, partial(self._take, reader))
@@ -105,32 +95,21 @@ class RosSource(NothingToClose):
     @property
     def counts(self) -> LinkCounts:
         """Counters since the source was opened."""
-        queue, refusals = self._queue, self._transport.refusals
-        return LinkCounts(
-            received=queue.received,
-            garbage=self._garbage + len(refusals),
-            dropped=queue.dropped,
-            reconnects=self._transport.reconnects,
-            last_garbage=refusals[-1] if refusals else self._last_garbage,
-        )
-
-    def poll(self, timeout_s: float) -> Event | None:
-        """Return the next event; None if none comes within `timeout_s` [s]."""
-        return self._queue.get(timeout_s)
+        return replace(self._counts, reconnects=self._transport.reconnects)
 
     def _take(self, reader: RosReader, decode: Decode) -> None:
         received_ns = time.time_ns()
-        with self._lock:  # a transport may have one thread per publisher
+        with self._one_by_one:  # a transport may have one thread per publisher
             try:
                 events = reader.events(*decode(), received_ns)
             # Anyone may publish anything here, and invalid bytes raise errors of struct, numpy or
             # rosbags. The message is counted; the next one may be valid.
             except Exception as error:
-                self._garbage += 1
-                self._last_garbage = f"{type(error).__name__}: {error}"
+                ours = isinstance(error, InputError)
+                self.put_garbage(str(error) if ours else f"{type(error).__name__}: {error}")
                 return
             for event in events:
-                self._queue.put(event)
+                self.put(event)
 
 
 class RosCommander(RosSource):
@@ -182,7 +161,7 @@ class RosCommander(RosSource):
         self._writer.start_at(target)
 
 
-class RosSink(NothingToClose):
+class RosSink(Sink):
     """Sink that publishes items on a ROS network; it does not close the transport.
 
     With a `RosWriter` it plays a robot: robots that listen to its commands will move.

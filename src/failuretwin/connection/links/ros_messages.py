@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,15 +12,15 @@ from failuretwin.connection.links.base import Answer, CommandSent, Event, Item, 
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.connection.links.ros_transport import Outgoing
 from failuretwin.connection.links.statuses import Status, statuses
+from failuretwin.connection.links.stream_time import SHORTEST_S, Ramp
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import MS_PER_S, FloatArray
 from failuretwin.data_knowledge.readers.bag_messages import (
-    KINDS,
     NS_PER_S,
     BagMessage,
     Kind,
     Role,
-    Rows,
+    check_role,
     kind_of_type,
     topic_rows,
 )
@@ -107,19 +108,18 @@ class RosReader:
         Raises:
             InputError: If it is invalid.
         """
-        if kind not in KINDS[self._role]:
-            raise InputError(f"{self._where}: {kind.value} cannot be the {self._role}.")
+        check_role(self._role, kind, f"{self._where}: {kind.value}")
         rows = topic_rows([BagMessage(received_ns, content)], kind, self._role, self._where)
         if self._role != "tool":
             rows = motor_rows(rows, self._robot)
-        if self._role == "command":
-            return self._commands(rows)
-        return self._readings(rows.stamp_ns.tolist(), rows.value)
-
-    def _readings(self, stamps_ns: list[int], values: FloatArray) -> list[Event]:
-        checked = self._checked(values, LARGEST)
-        rows = zip(stamps_ns, checked, strict=True)
-        return [self._reading(stamp / NS_PER_S, row) for stamp, row in rows]
+        self._check(rows.value, LARGEST)
+        times = (rows.stamp_ns / NS_PER_S).tolist()
+        if self._role != "command":
+            return list(map(self._reading, times, rows.value))
+        if rows.duration is not None:
+            return list(self._targets(times, rows.value, rows.duration))
+        samples = zip(times, map(self._completed, rows.value), strict=True)
+        return [sent for sample in samples if (sent := self._samples.add(*sample)) is not None]
 
     def _reading(self, time: float, value: FloatArray) -> Reading:
         if self._role == "tool":
@@ -130,23 +130,17 @@ class RosReader:
             return Reading(time, np.full(3, np.nan), value)
         return motor_reading(time, value, self._twin)
 
-    def _commands(self, rows: Rows) -> list[Event]:
-        targets = self._checked(rows.value, LARGEST)
-        times = (rows.stamp_ns / NS_PER_S).tolist()
-        if rows.duration is None:
-            samples = zip(times, targets, strict=True)
-            sampled = [self._samples.add(time, self._completed(row)) for time, row in samples]
-            return [command for command in sampled if command is not None]
-        durations = self._checked(rows.duration, LONGEST_S)
-        events: list[Event] = []
-        for row, stamp in enumerate(times):
-            target, longest = self._completed(targets[row]), float(np.nanmax(durations[row]))
+    def _targets(
+        self, times: list[float], targets: FloatArray, durations: FloatArray
+    ) -> Iterator[CommandSent]:
+        self._check(durations, LONGEST_S)
+        for row, target in enumerate(targets):
+            duration, longest = durations[row], float(np.nanmax(durations[row]))
             if row == 0 and len(times) > 1 and not longest > 0.0 and self._target is not None:
                 continue  # the first point of a trajectory may only repeat the present pose
-            self._target = target
-            duration = np.where(durations[row] >= 0, durations[row], longest)
-            events.append(CommandSent(stamp, target, duration))
-        return events
+            self._target = self._completed(target)
+            duration = np.where(duration >= 0, duration, longest)
+            yield CommandSent(times[row], self._target, duration)
 
     def _completed(self, target: FloatArray) -> FloatArray:
         """Return a target in which motors that are not named keep their last target."""
@@ -156,13 +150,12 @@ class RosReader:
             raise InputError(f"{self._where}: the first command does not name every motor.")
         return target
 
-    def _checked(self, values: FloatArray, largest: float) -> FloatArray:
+    def _check(self, values: FloatArray, largest: float) -> None:
         if np.any(np.abs(values) > largest):
             raise InputError(
                 f"{self._where}: a message holds {np.nanmax(np.abs(values)):g}, expected values up "
                 f"to {largest:g}."
             )
-        return values
 
 
 # Writing.
@@ -207,82 +200,60 @@ class RosWriter:
     def messages(self, item: Item) -> list[Outgoing]:
         """Return the messages of a reading or command; none for an answer."""
         if isinstance(item, Reading):
-            return self._of_reading(item)
+            return list(self._of_reading(item))
         return [self.command(item)] if isinstance(item, CommandSent) else []
 
     def command(self, command: CommandSent) -> Outgoing:
         """Return the message of a command."""
-        type_ = self._topics.command_type
+        topic, type_ = self._topics.command, self._topics.command_type
         if kind_of_type(type_) is Kind.TRAJECTORY:
-            content = self._trajectory(command)
+            message = Outgoing(topic, type_, self._trajectory(command))
         else:
-            content = self._joints(command.time, command.target, type_)
+            message = self._joints(topic, type_, command.time, command.target)
             # The authors' message has no field for durations; they write them as temperatures.
-            content["temperature"] = (command.duration * MS_PER_S).tolist()
+            message.content["temperature"] = (command.duration * MS_PER_S).tolist()
         self._origin = command.target
-        return Outgoing(self._topics.command, type_, content)
+        return message
 
-    def _of_reading(self, reading: Reading) -> list[Outgoing]:
-        topics, time, messages = self._topics, reading.time, []
-        for topic, type_, angle in (
-            (topics.position, topics.position_type, reading.position),
-            (topics.goal, topics.goal_type, reading.goal),
-        ):
-            if topic and angle is not None:
-                messages.append(Outgoing(topic, type_, self._joints(time, angle, type_)))
+    def _of_reading(self, reading: Reading) -> Iterator[Outgoing]:
+        topics, time = self._topics, reading.time
+        if topics.position and reading.position is not None:
+            yield self._joints(topics.position, topics.position_type, time, reading.position)
+        if topics.goal and reading.goal is not None:
+            yield self._joints(topics.goal, topics.goal_type, time, reading.goal)
         if topics.tool and np.isfinite(reading.tool).all():
-            messages.append(Outgoing(topics.tool, topics.tool_type, self._tool(reading)))
-        return messages
+            yield Outgoing(topics.tool, topics.tool_type, self._tool(reading))
 
-    def _joints(self, time: float, angle: FloatArray, type_: str) -> dict[str, Any]:
-        motors, header = self._robot.motors, _header(time)
+    def _joints(self, topic: str, type_: str, time: float, angle: FloatArray) -> Outgoing:
+        motors = self._robot.motors
         if kind_of_type(type_) is Kind.JOINT_STATE:
-            return {
-                "header": header,
-                "name": [motor.joint for motor in motors],
-                "position": angle.tolist(),
-                "velocity": [],
-                "effort": [],
-            }
-        return {
-            "header": header,
-            "name": [motor.log_column for motor in motors],
-            "position": self._robot.servo_units.to_counts(angle).tolist(),
-            "temperature": [],
-            "voltage": [],
-        }
+            names, values = [motor.joint for motor in motors], angle
+        else:
+            names = [motor.log_column for motor in motors]
+            values = self._robot.servo_units.to_counts(angle)
+        content = {"header": _header(time), "name": names, "position": values.tolist()}
+        return Outgoing(topic, type_, content)
 
     def _tool(self, reading: Reading) -> dict[str, Any]:
         header = {**_header(reading.time), "frame_id": self._robot.profile.base_link}
         point = dict(zip("xyz", reading.tool.tolist(), strict=True))
         if kind_of_type(self._topics.tool_type) is Kind.POINT:
             return {"header": header, "point": point}
-        unknown = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
-        return {"header": header, "pose": {"position": point, "orientation": unknown}}
+        return {"header": header, "pose": {"position": point, "orientation": {"w": 1.0}}}
 
     def _trajectory(self, command: CommandSent) -> dict[str, Any]:
         """Return a trajectory with one point per time of arrival, which makes it exact."""
-        points = []
-        for due in np.unique(command.duration):
-            share = np.divide(
-                due, command.duration, out=np.ones_like(command.target), where=command.duration > 0
-            )
-            angle = self._origin + np.minimum(share, 1.0) * (command.target - self._origin)
-            points.append(
-                {
-                    "positions": angle.tolist(),
-                    "velocities": [],
-                    "accelerations": [],
-                    "effort": [],
-                    "time_from_start": _stamp(float(due)),
-                }
-            )
+        ramp = Ramp(0.0, self._origin, command.target, command.duration)
+        points = [
+            {"positions": ramp.at(max(due, SHORTEST_S)).tolist(), "time_from_start": _stamp(due)}
+            for due in np.unique(command.duration).tolist()
+        ]
         names = [motor.joint for motor in self._robot.motors]
         return {"header": _header(command.time), "joint_names": names, "points": points}
 
 
 def _header(time: float) -> dict[str, Any]:
-    return {"seq": 0, "stamp": _stamp(time), "frame_id": ""}
+    return {"stamp": _stamp(time)}
 
 
 def _stamp(time: float) -> dict[str, int]:

@@ -119,10 +119,4 @@ def load_topics(path: Path | None) -> RosTopics:
     Raises:
         InputError: If the file cannot be read, or has an unknown key or an invalid value.
     """
-    if path is None:
-        return RosTopics()
-    try:
-        return from_table(RosTopics, read_toml(path), str(path))
-    except InputError as error:
-        where = "" if str(error).startswith(str(path)) else f"{path}: "
-        raise InputError(f"{where}{error}") from error
+    return RosTopics() if path is None else from_table(RosTopics, read_toml(path), str(path))
