@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from threading import Condition
 from typing import Protocol, Self, cast
+
+import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import ALL_CLEAR, Alarm, Diagnosis
@@ -31,7 +33,7 @@ class Reading:
     """
 
     time: float
-    tool: FloatArray
+    tool: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
     position: FloatArray | None = None
     goal: FloatArray | None = None
 
@@ -280,15 +282,12 @@ def source_from_text(text: str, robot: Robot) -> Source:
     name, *address = rest.split(":", 1)
     try:
         made = getattr(import_module(module), name)(robot, *address)
+        lacking = [part for part in SOURCE_PARTS if not hasattr(made, part)]
+        if lacking:
+            raise AttributeError(f"lacks {', '.join(lacking)}")
     except (ImportError, AttributeError) as error:
         raise InputError(
             f"source {text!r}: {error}. Expected MODULE:CLASS, a class such as the docstring of "
             "failuretwin.connection.links.base.Source shows, in a module that Python finds."
         ) from error
-    lacking = [part for part in SOURCE_PARTS if not hasattr(made, part)]
-    if lacking:
-        raise InputError(
-            f"source {text!r}: lacks {', '.join(lacking)}. Expected a class such as the docstring "
-            "of failuretwin.connection.links.base.Source shows."
-        )
     return cast(Source, made)

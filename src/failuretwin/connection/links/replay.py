@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from failuretwin.connection.links.base import CommandSent, Event, LinkCounts, Reading, Source
-from failuretwin.connection.links.ros_messages import SampledCommands, goal_reading, motor_reading
+from failuretwin.connection.links.ros_messages import SampledCommands, motor_reading
+from failuretwin.connection.links.stream_time import order
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import GOAL_VARIABLE
 from failuretwin.data_knowledge.readers.bag_file import is_bag
@@ -139,10 +140,7 @@ def session_events(session: RawSession, robot: Robot) -> Iterator[Event]:
 
 
 def log_events(log: TimedLog, robot: Robot) -> Iterator[Event]:
-    """Yield the commands and readings of a log in the order of their times.
-
-    A command goes before a reading of the same time.
-    """
+    """Yield the commands and readings of a log in the order of their times."""
     events: list[Event] = list(_commands(log.command))
     goals, twin = log.sensors.get(GOAL_VARIABLE), DigitalTwin(robot)
     if log.tool is not None:
@@ -153,8 +151,9 @@ def log_events(log: TimedLog, robot: Robot) -> Iterator[Event]:
     else:
         raise InputError(f"{log.name}: holds neither a tool path nor motor readings.")
     if goals is not None:
-        events += map(goal_reading, goals.time.tolist(), goals.value)
-    return iter(sorted(events, key=lambda event: (event.time, isinstance(event, Reading))))
+        reported = zip(goals.time.tolist(), goals.value, strict=True)
+        events += [Reading(time, goal=goal) for time, goal in reported]
+    return iter(sorted(events, key=order))
 
 
 def _commands(command: Samples | Targets) -> Iterator[CommandSent]:

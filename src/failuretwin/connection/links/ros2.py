@@ -54,16 +54,10 @@ def _open_session(host: str, port: int) -> Any:
     """
     with needs_extra("ROS 2 needs eclipse-zenoh", "ros2"):
         import zenoh
-    config, endpoint = zenoh.Config(), f"tcp/{host}:{port}"
-    settings = {
-        "mode": "client",
-        "connect/endpoints": [endpoint],
-        "scouting/multicast/enabled": False,
-    }
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
+    endpoint, alone = f"tcp/{host}:{port}", {"multicast": {"enabled": False}}
+    settings = {"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": alone}
     try:
-        return zenoh.open(config)
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
     except zenoh.ZError as error:
         raise InputError(
             f"no Zenoh router answers at {endpoint}. Start one there: `ros2 run rmw_zenoh_cpp "

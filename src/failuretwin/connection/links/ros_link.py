@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from functools import partial
-from threading import Lock
 from urllib.parse import urlsplit
 
 from failuretwin.connection.links.base import (
@@ -49,35 +48,23 @@ def open_transport(text: str) -> Transport:
     """
     if text == ROS1:
         return Ros1Transport()
-    if text == ROS2:
-        return Ros2Transport()
-    if text.startswith(f"{ROS2}://"):
-        return Ros2Transport(*_address(text, ROUTER_PORT))
-    return RosbridgeTransport(*_address(text, BRIDGE_PORT))
-
-
-def _address(text: str, usual_port: int) -> tuple[str, int]:
-    """Return host and port of an address such as ``rosbridge://HOST[:PORT]``."""
+    kind = text.partition("://")[0]
     try:
-        address = urlsplit(text)
-        host, port = address.hostname, address.port or usual_port
+        address = urlsplit(f"{ROS2}://localhost" if text == ROS2 else text)
+        host, port = address.hostname, address.port
     except ValueError:
-        host, port = None, 0
+        host, port = None, None
     if not host:
-        kind = text.partition("://")[0]
         raise InputError(f"{text!r} is no address. Expected {kind}://HOST[:PORT].")
-    return host, port
+    if kind == ROS2:
+        return Ros2Transport(host, port or ROUTER_PORT)
+    return RosbridgeTransport(host, port or BRIDGE_PORT)
 
 
 class RosSource(Link):
-    """Readings and commands on a ROS network; it does not close the transport.
+    """Readings and commands of a robot on a ROS network; it does not close the transport.
 
     Invalid messages are counted and left out.
-
-    Args:
-        robot: The robot.
-        topics: Its topics.
-        transport: Connection to the network.
 
     Raises:
         InputError: If messages hold servo counts and the robot's profile has none.
@@ -87,7 +74,6 @@ class RosSource(Link):
         topics.check_fits(robot)
         super().__init__(f"{transport.name}: {', '.join(name for _, name, _ in topics.subscribed)}")
         self._transport = transport
-        self._one_by_one = Lock()
         for role, topic, type_ in topics.subscribed:
             reader = RosReader(robot, role, topics)
             transport.subscribe(topic, type_, partial(self._take, reader))
@@ -99,7 +85,7 @@ class RosSource(Link):
 
     def _take(self, reader: RosReader, decode: Decode) -> None:
         received_ns = time.time_ns()
-        with self._one_by_one:  # a transport may have one thread per publisher
+        with self._changed:  # a transport may have one thread per publisher
             try:
                 events = reader.events(*decode(), received_ns)
             # Anyone may publish anything here, and invalid bytes raise errors of struct, numpy or
@@ -114,11 +100,6 @@ class RosSource(Link):
 
 class RosCommander(RosSource):
     """Source that also publishes orders, one message each.
-
-    Args:
-        robot: The robot.
-        topics: Its topics.
-        transport: Connection to the network.
 
     Raises:
         InputError: If messages hold servo counts and the robot's profile has none, or commands are
@@ -139,9 +120,9 @@ class RosCommander(RosSource):
         if event is not None:
             self._ahead_s = event.time - time.monotonic()
         if isinstance(event, CommandSent):
-            self._stand_at(event.target)
+            self.standing = self._writer.origin = event.target
         elif self.standing is None and isinstance(event, Reading) and event.position is not None:
-            self._writer.start_at(event.position)
+            self._writer.origin = event.position
         return event
 
     def send(self, order: Order) -> None:
@@ -154,21 +135,13 @@ class RosCommander(RosSource):
         stamp = time.monotonic() + self._ahead_s
         command = CommandSent(stamp, order.target, order.duration)
         self._transport.publish(self._writer.command(command))
-        self._stand_at(order.target)
-
-    def _stand_at(self, target: FloatArray) -> None:
-        self.standing = target
-        self._writer.start_at(target)
+        self.standing = order.target
 
 
 class RosSink(Sink):
     """Sink that publishes items on a ROS network; it does not close the transport.
 
     With a `RosWriter` it plays a robot: robots that listen to its commands will move.
-
-    Args:
-        writer: Converts items into messages.
-        transport: Connection to the network.
     """
 
     def __init__(self, writer: RosWriter | DiagnosticsWriter, transport: Transport) -> None:

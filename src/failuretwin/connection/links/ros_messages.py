@@ -44,13 +44,9 @@ def motor_reading(time: float, angle: FloatArray, twin: DigitalTwin) -> Reading:
         angle: (motor,) [rad], NaN where one is missing; then there is no tool position.
         twin: Kinematics of the robot.
     """
-    complete = bool(np.isfinite(angle).all())
-    return Reading(time, twin.path(angle) if complete else np.full(3, np.nan), angle)
-
-
-def goal_reading(time: float, goal: FloatArray) -> Reading:
-    """Return a reading of nothing but the goals that the motors report, (motor,) [rad]."""
-    return Reading(time, np.full(3, np.nan), goal=goal)
+    if np.isfinite(angle).all():
+        return Reading(time, twin.path(angle), angle)
+    return Reading(time, position=angle)
 
 
 class SampledCommands:
@@ -66,9 +62,7 @@ class SampledCommands:
     def add(self, time: float, value: FloatArray) -> CommandSent | None:
         """Return the command that a sample completes, None while the reference stands still.
 
-        Args:
-            time: Time of the sample [s].
-            value: The reference, (motor,) [rad].
+        Samples have a time [s] and the reference then, (motor,) [rad].
         """
         before, self._before = self._before, (time, value)
         if before is None:
@@ -79,12 +73,9 @@ class SampledCommands:
 
 
 class RosReader:
-    """Converts the messages of one topic into events.
+    """Converts the messages of the topic with one role into events.
 
-    Args:
-        robot: The robot.
-        role: Role of the topic.
-        topics: All topics. Motor readings give the tool position only if no tool topic is named.
+    Motor readings give the tool position only if no tool topic is named.
     """
 
     def __init__(self, robot: Robot, role: Role, topics: RosTopics) -> None:
@@ -122,13 +113,9 @@ class RosReader:
         return [sent for sample in samples if (sent := self._samples.add(*sample)) is not None]
 
     def _reading(self, time: float, value: FloatArray) -> Reading:
-        if self._role == "tool":
-            return Reading(time, value)
-        if self._role == "goal":
-            return goal_reading(time, value)
-        if self._sees_tool:
-            return Reading(time, np.full(3, np.nan), value)
-        return motor_reading(time, value, self._twin)
+        if self._role == "position" and not self._sees_tool:
+            return motor_reading(time, value, self._twin)
+        return Reading(time, **{self._role: value})
 
     def _targets(
         self, times: list[float], targets: FloatArray, durations: FloatArray
@@ -168,9 +155,8 @@ PERIOD_S = 1.0
 class RosWriter:
     """Writes readings and commands as the robot itself would.
 
-    Args:
-        robot: The robot.
-        topics: Its topics.
+    Attributes:
+        origin: Angles from which the next command starts, (motor,) [rad].
 
     Raises:
         InputError: If commands are a stream of set-points, which cannot carry single commands, or
@@ -186,11 +172,7 @@ class RosWriter:
         topics.check_fits(robot)
         self._robot = robot
         self._topics = topics
-        self._origin = np.zeros(len(robot.motors))
-
-    def start_at(self, angle: FloatArray) -> None:
-        """Set the angles from which the next command starts, (motor,) [rad]."""
-        self._origin = angle
+        self.origin = np.zeros(len(robot.motors))
 
     @property
     def topics(self) -> list[tuple[str, str]]:
@@ -212,7 +194,7 @@ class RosWriter:
             message = self._joints(topic, type_, command.time, command.target)
             # The authors' message has no field for durations; they write them as temperatures.
             message.content["temperature"] = (command.duration * MS_PER_S).tolist()
-        self._origin = command.target
+        self.origin = command.target
         return message
 
     def _of_reading(self, reading: Reading) -> Iterator[Outgoing]:
@@ -243,7 +225,7 @@ class RosWriter:
 
     def _trajectory(self, command: CommandSent) -> dict[str, Any]:
         """Return a trajectory with one point per time of arrival, which makes it exact."""
-        ramp = Ramp(0.0, self._origin, command.target, command.duration)
+        ramp = Ramp(0.0, self.origin, command.target, command.duration)
         points = [
             {"positions": ramp.at(max(due, SHORTEST_S)).tolist(), "time_from_start": _stamp(due)}
             for due in np.unique(command.duration).tolist()
@@ -263,10 +245,6 @@ def _stamp(time: float) -> dict[str, int]:
 
 class DiagnosticsWriter:
     """Writes answers as diagnostics: every second, and at once when a status gets worse.
-
-    Args:
-        robot: The robot.
-        topics: Its topics.
 
     Attributes:
         topics: Name and type of the topic that is written to.
