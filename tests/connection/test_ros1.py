@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -135,6 +136,19 @@ def test_messages_that_make_no_sense_are_counted_and_left_out(armpi, peer):
 NO_SPEEDS = {"velocities": [], "accelerations": [], "effort": []}
 
 
+def test_a_node_that_may_talk_to_this_computer_alone_is_heard(armpi, roscore):
+    """rospy looks for the addresses of this computer when it connects; Debian has what it needs."""
+    code = """
+import sys
+from failuretwin.connection.links.ros1 import Ros1Transport
+with Ros1Transport() as transport:
+    import rosgraph.network
+    print(rosgraph.network.is_local_address("127.0.0.1"), "netifaces" in sys.modules)
+"""
+    environment = {**os.environ, "ROS_HOSTNAME": "localhost", "ROS_MASTER_URI": roscore.uri}
+    assert run(code, environment) == ["True", "True"]
+
+
 def test_ten_times_the_rate_is_taken(armpi, roscore):
     with Ros1Transport() as transport:
         source = RosSource(armpi, STANDARD, transport)
@@ -252,9 +266,14 @@ def test_diagnostics_come_every_second_and_at_once_when_it_gets_worse(monkeypatc
 # The import of rospy.
 
 
-def run(code):
+def run(code, environment=None):
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+        env=environment,
     )
     return done.stdout.split()
 
@@ -270,7 +289,7 @@ rospy = load_rospy()
 import numpy
 print(rospy.__file__)
 print(numpy.__file__)
-print(*(importlib.util.find_spec(name) is None for name in ("apt", "gi", "genpy")))
+print(*(importlib.util.find_spec(name) is None for name in ("apt", "gi", "catkin_pkg")))
 """
     rospy, numpy, *hidden = run(code)
     assert rospy.startswith("/usr/lib/python3/dist-packages/")

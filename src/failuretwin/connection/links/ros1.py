@@ -37,11 +37,12 @@ QUIET_LOGS = ("rospy", "rosout", "rosgraph", "rospy.internal", "rospy.topics", "
 @contextmanager
 def _debian_folder() -> Iterator[None]:
     """Let Python find Debian's modules, after all others, for as long as rospy is imported."""
+    before = [*sys.path]
     sys.path.append(DEBIAN_FOLDER)
     try:
         yield
     finally:
-        sys.path.remove(DEBIAN_FOLDER)
+        sys.path[:] = before
 
 
 def load_rospy() -> Any:
@@ -103,6 +104,8 @@ def _join() -> Any:
     quiet = {"disable_signals": True, "disable_rosout": True, "disable_rostime": True}
     with _debian_folder():
         rospy.init_node(NODE, argv=[], anonymous=True, **quiet)
+        # rospy would import netifaces for this only later; it keeps the answer.
+        rospy.core.rosgraph.network.get_local_addresses()
     for name in QUIET_LOGS:  # the transport itself reports a master that is gone
         logging.getLogger(name).setLevel(logging.CRITICAL)
     return rospy

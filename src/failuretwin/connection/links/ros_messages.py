@@ -83,7 +83,7 @@ class RosReader:
         self._twin = DigitalTwin(robot)
         self._role = role
         self._sees_tool = bool(topics.tool)
-        self._where = next(f"topic {name}" for r, name, _ in topics.subscribed if r == role)
+        self._where = f"topic {getattr(topics, role)}"
         self._samples = SampledCommands()
         self._target: FloatArray | None = None
 
