@@ -116,7 +116,7 @@ def stream_answers(session: RawSession, robot: Robot) -> list[str | None]:
         # Where the arm was told to stand before the run is known from the command before it.
         before = [e for e in events if isinstance(e, CommandSent) and e.time < begin][-1:]
         inside = [e for e in events if begin <= e.time < end]
-        source = PacedSource("run", iter(before + inside), Pace(AS_FAST_AS_POSSIBLE))
+        source = PacedSource("run", iter([*before, *inside]), Pace(AS_FAST_AS_POSSIBLE))
         shadow = Shadow(source, StreamingDiagnoser(BayesDiagnoser(twin)), twin)
         while shadow.step(0.0):
             pass

@@ -325,7 +325,7 @@ FASTER = 4.0
 def arm_on_rosbridge(server, arm, robot, over):
     """Let a server say what an arm does, orders of others too, and the arm do what it hears."""
     writer, done = RosWriter(robot, STANDARD), 0
-    writer.start_at(arm.pose)
+    writer.origin = arm.pose
     while not over.wait(0.1 / FASTER):
         for call in server.published[done:]:
             last = call["msg"]["points"][-1]

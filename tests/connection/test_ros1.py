@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -10,8 +11,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from failuretwin.connection.links import ros_link, ros_messages
-from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, EventQueue, Reading
+from failuretwin.connection.links import ros_messages
+from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, Reading
 from failuretwin.connection.links.ros1 import Ros1Transport
 from failuretwin.connection.links.ros_link import RosSink, RosSource
 from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosWriter
@@ -135,6 +136,19 @@ def test_messages_that_make_no_sense_are_counted_and_left_out(armpi, peer):
 NO_SPEEDS = {"velocities": [], "accelerations": [], "effort": []}
 
 
+def test_a_node_that_may_talk_to_this_computer_alone_is_heard(armpi, roscore):
+    """rospy looks for the addresses of this computer when it connects; Debian has what it needs."""
+    code = """
+import sys
+from failuretwin.connection.links.ros1 import Ros1Transport
+with Ros1Transport() as transport:
+    import rosgraph.network
+    print(rosgraph.network.is_local_address("127.0.0.1"), "netifaces" in sys.modules)
+"""
+    environment = {**os.environ, "ROS_HOSTNAME": "localhost", "ROS_MASTER_URI": roscore.uri}
+    assert run(code, environment) == ["True", "True"]
+
+
 def test_ten_times_the_rate_is_taken(armpi, roscore):
     with Ros1Transport() as transport:
         source = RosSource(armpi, STANDARD, transport)
@@ -153,18 +167,17 @@ def test_ten_times_the_rate_is_taken(armpi, roscore):
 
 
 def test_a_consumer_that_sleeps_loses_readings_but_no_command(monkeypatch, armpi, roscore):
-    queue = EventQueue(capacity=50)
-    monkeypatch.setattr(ros_link, "EventQueue", lambda: queue)
     topics = RosTopics()
     with Ros1Transport() as transport:
         source = RosSource(armpi, topics, transport)
+        monkeypatch.setattr(source, "_capacity", 50)
         sink = RosSink(RosWriter(armpi, topics), transport)
         wait_until_connected(source, sink)
         sink.put(CommandSent(1.0, np.full(4, 0.1), np.ones(4)))
         for k in range(300):
             sink.put(reading(1000.0 + k))
             time.sleep(0.002)
-        wait_for(lambda: queue.dropped > 200)
+        wait_for(lambda: source.counts.dropped > 200)
         kept = [source.poll(0.1) for _ in range(50)]
     assert sum(isinstance(event, CommandSent) for event in kept) == 1
     assert sum(isinstance(event, Reading) for event in kept) == 49
@@ -253,9 +266,14 @@ def test_diagnostics_come_every_second_and_at_once_when_it_gets_worse(monkeypatc
 # The import of rospy.
 
 
-def run(code):
+def run(code, environment=None):
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+        env=environment,
     )
     return done.stdout.split()
 

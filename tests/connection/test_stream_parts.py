@@ -1,4 +1,4 @@
-"""Small parts of the live loop: queue, clock, order of events, statuses, beat."""
+"""Small parts of the live loop: link, clock, order of events, statuses, beat."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from failuretwin.connection.links.base import (
     STALE,
     Answer,
     CommandSent,
-    EventQueue,
+    Link,
     Reading,
     Sink,
     Source,
@@ -57,34 +57,35 @@ def command(t):
     return CommandSent(t, np.zeros(4), np.ones(4))
 
 
-def test_a_full_queue_gives_up_the_oldest_readings_and_keeps_commands():
-    queue = EventQueue(capacity=3)
+def test_a_full_link_gives_up_the_oldest_readings_and_keeps_commands():
+    link = Link("slow", capacity=3)
     for event in (command(0.0), reading(1.0), reading(2.0), reading(3.0), command(4.0)):
-        queue.put(event)
-    assert [queue.get(0.0).time for _ in range(3)] == [0.0, 3.0, 4.0]
-    assert queue.get(0.0) is None
-    assert (queue.received, queue.dropped) == (5, 2)
+        link.put(event)
+    assert [link.poll(0.0).time for _ in range(3)] == [0.0, 3.0, 4.0]
+    assert link.poll(0.0) is None
+    assert (link.counts.received, link.counts.dropped) == (5, 2)
 
 
 def test_a_slow_consumer_costs_no_memory():
-    queue = EventQueue(capacity=100)
+    link = Link("slow", capacity=100)
     for t in range(10_000):
-        queue.put(reading(float(t)))
-    assert len(queue) == 100
-    assert queue.dropped == 9_900
+        link.put(reading(float(t)))
+    assert link.counts.dropped == 9_900
+    assert [link.poll(0.0).time for _ in range(100)] == list(range(9_900, 10_000))
+    assert link.poll(0.0) is None
 
 
-def test_a_queue_of_commands_alone_stays_bounded():
-    queue = EventQueue(capacity=2)
+def test_a_link_of_commands_alone_stays_bounded():
+    link = Link("slow", capacity=2)
     for t in range(5):
-        queue.put(command(float(t)))
-    assert [queue.get(0.0).time for _ in range(2)] == [3.0, 4.0]
+        link.put(command(float(t)))
+    assert [link.poll(0.0).time for _ in range(2)] == [3.0, 4.0]
 
 
-def test_a_queue_wakes_who_waits():
-    queue = EventQueue()
-    threading.Timer(0.1, queue.put, [reading(1.0)]).start()
-    assert queue.get(threading.TIMEOUT_MAX).time == 1.0  # never, if nobody wakes it
+def test_a_link_wakes_who_waits():
+    link = Link("waited for")
+    threading.Timer(0.1, link.put, [reading(1.0)]).start()
+    assert link.poll(threading.TIMEOUT_MAX).time == 1.0  # never, if nobody wakes it
 
 
 @pytest.mark.parametrize("jump", [YEAR_S, -YEAR_S, 3600.0, -30.0])

@@ -8,7 +8,7 @@ change keeps its place.
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,15 +20,8 @@ from failuretwin.connection.emulated_arm import (
     EmulatedArm,
     Emulation,
 )
-from failuretwin.connection.links.base import (
-    CommandSent,
-    Event,
-    LinkCounts,
-    NothingToClose,
-    Order,
-    Reading,
-)
-from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace
+from failuretwin.connection.links.base import CommandSent, Event, Order, Reading
+from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace, PacedSource, Wait
 from failuretwin.connection.links.stream_time import Ramp
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray, as_floats
@@ -43,7 +36,7 @@ OPERATOR = 1
 """Number of the operator's random stream, apart from the arm's own."""
 
 
-class CommandedArm(EmulatedArm, NothingToClose):
+class CommandedArm(EmulatedArm, PacedSource):
     """Emulated arm that takes orders; the same seed gives the same arm and disturbances.
 
     Disturbances are drawn per slice, so they differ by a clock and as fast as possible.
@@ -56,24 +49,16 @@ class CommandedArm(EmulatedArm, NothingToClose):
         InputError: If mujoco is missing.
     """
 
-    ended = False
-
     def __init__(self, emulation: Emulation, pace: Pace | None = None) -> None:
-        super().__init__(emulation)
-        self.name = f"emulated {emulation.robot.name}, commanded"
-        self._pace = pace or Pace(AS_FAST_AS_POSSIBLE)
-        self._slice_s = SLICE_S if self._pace.speed == AS_FAST_AS_POSSIBLE else PACED_SLICE_S
-        self._queue: deque[Event] = deque()
-        self._given = 0
+        EmulatedArm.__init__(self, emulation)
+        pace = pace or Pace(AS_FAST_AS_POSSIBLE)
+        name = f"emulated {emulation.robot.name}, commanded"
+        PacedSource.__init__(self, name, self._slices(), pace)
+        self._slice_s = SLICE_S if pace.speed == AS_FAST_AS_POSSIBLE else PACED_SLICE_S
         self._waiting: list[Order] = []
         self._ordered = self._commanded
         self._ramp = Ramp(0.0, self._told[-1], self._told[-1], np.zeros(len(self._commanded)))
         self._silent = (np.inf, np.inf)
-
-    @property
-    def counts(self) -> LinkCounts:
-        """Number of events given so far."""
-        return LinkCounts(received=self._given)
 
     @property
     def standing(self) -> FloatArray:
@@ -90,35 +75,30 @@ class CommandedArm(EmulatedArm, NothingToClose):
         self._waiting.append(order)
         self._ordered = order.target
 
-    def poll(self, timeout_s: float) -> Event | None:
-        """Return the next event; None if it is not due in time."""
-        while not self._queue:
-            if not self._pace.due(self._index * STEP_S, timeout_s):
-                return None
-            self._pass()
-        if not self._pace.due(self._queue[0].time, timeout_s):
-            return None
-        self._given += 1
-        return self._queue.popleft()
+    def _slices(self) -> Iterator[Event | Wait]:
+        """Yield the events of slices, each of which passes when it is due."""
+        while True:
+            yield Wait(self._index * STEP_S)
+            yield from self._pass()
 
-    def _pass(self) -> None:
-        """Let one slice of time pass."""
+    def _pass(self) -> list[Event]:
+        """Let one slice of time pass, and return its events."""
         steps = round(self._slice_s / STEP_S)
         time = as_floats(np.arange(self._index, self._index + steps + 1) * STEP_S)
-        now = float(time[0])
+        now, events = float(time[0]), list[Event]()
         if self._waiting and not self._silent[0] <= now < self._silent[1]:
-            self._begin(self._waiting.pop(0), now)
+            events.append(self._begin(self._waiting.pop(0), now))
         drawn = self._draw()
         faults = self._injection(now - MEMORY_S, float(time[-1]))
         position = self._follow(self._ramp.at(time), time, self._lag, faults)
-        self._read(position, time, drawn)
+        return [*events, *self._read(position, time, drawn)]
 
     @property
     def _lag(self) -> FloatArray:
         return np.asarray(self._self.lag)[None]
 
-    def _begin(self, order: Order, now: float) -> None:
-        """Begin an order, with its disturbances and faults."""
+    def _begin(self, order: Order, now: float) -> CommandSent:
+        """Begin an order, with its disturbances and faults; return it as it was sent."""
         drawn = self._draw()
         movement = Movements(
             self._commanded[None],
@@ -134,14 +114,16 @@ class CommandedArm(EmulatedArm, NothingToClose):
         duration = faulty.ramp_duration[0, 0] * (1.0 - self._self.shortening)
         self._ramp = Ramp(now + float(self._self.delay), here, np.where(stays, here, aim), duration)
         self._commanded = np.where(lost[0, 0], self._commanded, order.target)
-        self._queue.append(CommandSent(now, order.target, order.duration))
         late, period = float(drawn.late[1]), self._imperfections.schedule.period_s
         if late > 0.0:
             begin = now + float(drawn.gap_start[1])
             self._silent = begin, max(begin, now + 0.5 * sum(period)) + late
+        return CommandSent(now, order.target, order.duration)
 
-    def _read(self, position: FloatArray, time: FloatArray, drawn: Disturbances) -> None:
-        """Put the readings of a slice into the queue."""
+    def _read(
+        self, position: FloatArray, time: FloatArray, drawn: Disturbances
+    ) -> Iterator[Reading]:
+        """Yield the readings of a slice."""
         local, zero = time - time[0], np.zeros((1, 1))
         chance = stack([self._with_readings(drawn, time)])
         chance = replace(chance, stalled=np.array([False]), late=zero, gap_start=zero)
@@ -150,7 +132,7 @@ class CommandedArm(EmulatedArm, NothingToClose):
         seen = np.isfinite(angle[0]).any(axis=1) & (local > 0.0)
         seen &= ~((time >= self._silent[0]) & (time < self._silent[1]))
         for k in np.flatnonzero(seen):
-            self._queue.append(Reading(float(time[k]), measured[0, k], angle[0, k]))
+            yield Reading(float(time[k]), measured[0, k], angle[0, k])
 
 
 # Work in shifts.
@@ -194,17 +176,12 @@ class OperatedArm(CommandedArm):
         self._chance = np.random.default_rng([emulation.seed, OPERATOR])
         self._next_s, self._made = FIRST_COMMAND_S, 0
 
-    def poll(self, timeout_s: float) -> Event | None:
-        """Return the next event; None if it is not due in time, or the arm has ended."""
-        if not self._queue and self._index * STEP_S >= self._shifts.duration_s:
-            self.ended = True
-            return None
-        return super().poll(timeout_s)
-
-    def _pass(self) -> None:
-        if self._index * STEP_S >= self._next_s:
-            self._work()
-        super()._pass()
+    def _slices(self) -> Iterator[Event | Wait]:
+        while self._index * STEP_S < self._shifts.duration_s:
+            yield Wait(self._index * STEP_S)
+            if self._index * STEP_S >= self._next_s:
+                self._work()
+            yield from self._pass()
 
     def _work(self) -> None:
         """Order the next movement of a shift, once the one before has begun."""

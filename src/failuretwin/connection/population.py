@@ -235,6 +235,10 @@ def _fitted(known: Sequence[CalibratedRobot], robot: Robot) -> Population:
     )
     profile = [m.imperfections for m in known if m.robot.motors == robot.motors]
     readings = [one.readings for one in each if one.readings is not None]
+    bias = np.hypot(figures["bias"].deviation, class_of(robot).session_rad)
+    others = figures["compliance"].deviation, figures["friction"].deviation
+    scatter = _listed(figures["scatter"].deviation)
+    doubt = Variation(scatter=scatter, rates=_rate_deviation(each, usual))
     imperfections = Imperfections(
         name=name,
         source=source,
@@ -243,7 +247,7 @@ def _fitted(known: Sequence[CalibratedRobot], robot: Robot) -> Population:
         lost_commands=_losses(each, usual),
         schedule=_schedule([one.schedule for one in each]),
         readings=_typical(readings) if readings else None,
-        variation=_variation(figures, each, usual, class_of(robot).session_rad),
+        variation=stated_variation(np.concatenate([bias, *others]), settling, doubt),
     )
     return Population(imperfections, tuple(_parameters(figures, imperfections, robot)), names)
 
@@ -302,25 +306,24 @@ def _likelihood(
     return np.where(told, usual + (value - usual) / rest, np.nan), doubt / np.sqrt(rest)
 
 
-def _variation(
-    figures: dict[str, Pooled],
-    each: Sequence[Imperfections],
-    usual: Imperfections,
-    session_rad: float,
+def stated_variation(
+    deviation: FloatArray, settling: Settling, others: Variation | None = None
 ) -> Variation:
-    """Return what robots differ by, as a calibration states it: of compliance as a share.
+    """Return deviations as a calibration states them: of compliance as a share, 1 at most.
 
-    A share of 1 at most, as what is self-calibrated states it.
+    Args:
+        deviation: Of bias, compliance and friction, (3 motor,) or (3, motor).
+        settling: Where motors settle.
+        others: All other deviations; None: none.
     """
-    compliance = figures["compliance"]
-    size = np.abs(compliance.mean)
-    share = np.divide(compliance.deviation, size, out=np.zeros_like(size), where=size > 1e-9)
-    return Variation(
-        bias=_listed(np.hypot(figures["bias"].deviation, session_rad)),
+    bias, compliance, friction = deviation.reshape(3, -1)
+    mean = np.abs(np.asarray(settling.compliance))
+    share = np.divide(compliance, mean, out=np.zeros_like(mean), where=mean > 1e-9)
+    return replace(
+        others or Variation(),
+        bias=_listed(bias),
         compliance=_listed(np.minimum(share, 1.0)),
-        friction=_listed(figures["friction"].deviation),
-        scatter=_listed(figures["scatter"].deviation),
-        rates=_rate_deviation(each, usual),
+        friction=_listed(friction),
     )
 
 

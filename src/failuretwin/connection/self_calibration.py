@@ -20,7 +20,7 @@ from failuretwin.connection.calibration.observations import session_names
 from failuretwin.connection.calibration.parameters import readings_of, schedule_of, timing_of
 from failuretwin.connection.calibration.result import SETTLING_UNITS, Calibration, Parameter
 from failuretwin.connection.calibration.timing_fit import gap_starts, lateness
-from failuretwin.connection.population import Population
+from failuretwin.connection.population import Population, stated_variation
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.movements import Movements
@@ -36,7 +36,7 @@ from failuretwin.digital_model.calibrated_robot import (
 from failuretwin.digital_model.geometry import SensorFrame, roll_pitch_yaw
 from failuretwin.digital_model.nonidealities import Imperfections, LostCommand, Variation
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.settling import Settling, poses_in_range
+from failuretwin.digital_model.settling import poses_in_range
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.faults.priors import Priors
@@ -184,17 +184,10 @@ class SelfCalibratingDiagnoser:
         believed = calibrated(self.robot, self._figures or generic_imperfections(robot))
         if self._figures is not None:
             return believed.imperfections
-        late = lateness(movements)
-        timing = timing_of(None, late, gap_starts(runs, movements, late.late))
-        losses = believed.imperfections.lost_commands
-        if timing.late_rate > 0.0:
-            losses = tuple(more_when_late(entry) for entry in losses)
-        return replace(
-            believed.imperfections,
-            timing=timing,
-            schedule=schedule_of(movements, late, robot),
-            lost_commands=losses,
-        )
+        known = with_timing_of(believed.imperfections, movements, robot, runs)
+        if known.timing.late_rate <= 0.0:
+            return known
+        return replace(known, lost_commands=tuple(map(more_when_late, known.lost_commands)))
 
 
 def _name(robot: Robot) -> str:
@@ -212,6 +205,23 @@ def check_moves(movements: Movements) -> None:
             "no run holds a movement: `command` never leaves its first value. Expected runs "
             "of one movement at least."
         )
+
+
+def with_timing_of(
+    known: Imperfections, movements: Movements, robot: Robot, runs: xr.Dataset | None = None
+) -> Imperfections:
+    """Return imperfections with the late starts and the schedule that commands tell.
+
+    Args:
+        known: What is believed of the robot otherwise.
+        movements: Movements as they were commanded.
+        robot: The robot.
+        runs: Their runs, which tell when readings stop before a late start; None: not known.
+    """
+    late = lateness(movements)
+    gaps = np.zeros(0) if runs is None else gap_starts(runs, movements, late.late)
+    schedule = schedule_of(movements, late, robot)
+    return replace(known, timing=timing_of(None, late, gaps), schedule=schedule)
 
 
 def more_when_late(entry: LostCommand) -> LostCommand:
@@ -273,23 +283,6 @@ def _variation(found: FolderPosterior) -> Variation:
         return found.model.imperfections.variation or Variation()
     own = np.linalg.inv(np.linalg.inv(found.covariance)[REGISTRATION:, REGISTRATION:])
     return stated_variation(np.sqrt(np.diag(own)), found.model.settling)
-
-
-def stated_variation(deviation: FloatArray, settling: Settling) -> Variation:
-    """Return deviations as a calibration states them: of compliance as a share, 1 at most.
-
-    Args:
-        deviation: Of bias, compliance and friction, (3 motor,).
-        settling: Where motors settle.
-    """
-    bias, compliance, friction = deviation.reshape(3, -1)
-    mean = np.abs(np.asarray(settling.compliance))
-    share = np.divide(compliance, mean, out=np.zeros_like(mean), where=mean > 1e-9)
-    return Variation(
-        bias=tuple(bias.tolist()),
-        compliance=tuple(np.minimum(share, 1.0).tolist()),
-        friction=tuple(friction.tolist()),
-    )
 
 
 def _parameters(found: FolderPosterior, believed: Imperfections, robot: Robot) -> list[Parameter]:

@@ -14,24 +14,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from failuretwin.connection.calibration.observations import session_names
-from failuretwin.connection.calibration.parameters import schedule_of, timing_of
 from failuretwin.connection.calibration.result import Calibration
-from failuretwin.connection.calibration.timing_fit import lateness
 from failuretwin.connection.life_history import History
+from failuretwin.connection.population import stated_variation
 from failuretwin.connection.self_calibration import (
     as_calibration,
     check_moves,
     more_when_late,
-    stated_variation,
+    with_timing_of,
 )
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.core.movements import Movements
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
-from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence
@@ -100,15 +97,10 @@ def begin(diagnoser: BayesDiagnoser, cold: bool, limits: WearLimits | None = Non
         )
     model = HealthyModel(diagnoser.twin, given)
     doubt = given.variation or Variation()
-    if not doubt.bias:
-        model = replace(model, imperfections=replace(given, variation=_assumed(model, doubt)))
+    if not doubt.bias:  # a calibration that states no doubt: a scatter of each motor, assumed
+        doubt = stated_variation(wear_unit(model), model.settling, doubt)
+        model = replace(model, imperfections=replace(given, variation=doubt))
     return LifeFilter.of(model, hypotheses, diagnoser.priors, limits or WearLimits())
-
-
-def _assumed(model: HealthyModel, doubt: Variation) -> Variation:
-    """Return the doubt of a calibration that states none: a scatter of each motor; assumed."""
-    usual = stated_variation(wear_unit(model), model.settling)
-    return replace(doubt, bias=usual.bias, compliance=usual.compliance, friction=usual.friction)
 
 
 def diagnose_tracked(
@@ -278,19 +270,6 @@ class _Seen:
             return now
         movements = life.joined_evidence(self.evidence[batch]).movements
         return with_timing_of(now, movements, self.diagnoser.twin.robot)
-
-
-def with_timing_of(known: Imperfections, movements: Movements, robot: Robot) -> Imperfections:
-    """Return imperfections with the late starts and the schedule that commands tell.
-
-    Args:
-        known: What is believed of the robot otherwise.
-        movements: Movements as they were commanded.
-        robot: The robot.
-    """
-    late = lateness(movements)
-    schedule = schedule_of(movements, late, robot)
-    return replace(known, timing=timing_of(None, late, np.zeros(0)), schedule=schedule)
 
 
 def calibration_of(life: LifeFilter, runs: xr.Dataset) -> Calibration:

@@ -1,12 +1,14 @@
-"""Readings, commands and answers, and the protocols of the links that carry them."""
+"""Readings, commands and answers, and the links that carry them."""
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from threading import Condition
 from typing import Protocol, Self, cast
+
+import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import ALL_CLEAR, Alarm, Diagnosis
@@ -31,7 +33,7 @@ class Reading:
     """
 
     time: float
-    tool: FloatArray
+    tool: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
     position: FloatArray | None = None
     goal: FloatArray | None = None
 
@@ -110,12 +112,12 @@ class Source(Protocol):
     """Source of readings and commands; implement it to watch a robot of your own.
 
     The constructor opens the source. One thread uses it in one ``with`` statement: it calls `poll`
-    repeatedly and reads `ended` and `counts` in between. A source with a thread of its own can put
-    what it hears into an `EventQueue`. Times are by the robot's clock and need not be in order.
-    `failuretwin watch MODULE:CLASS` watches such a class. The class is called with the robot, and
-    with the text after a second colon if there is one, such as an address::
+    repeatedly and reads `ended` and `counts` in between. A source with a thread of its own can be a
+    `Link`. Times are by the robot's clock and need not be in order. `failuretwin watch
+    MODULE:CLASS` watches such a class. The class is called with the robot, and with the text after
+    a second colon if there is one, such as an address::
 
-        class Replayed:
+        class Replayed(Source):
             name, ended, counts = "ten readings at rest", False, LinkCounts()
 
             def __init__(self, robot: Robot) -> None:
@@ -125,12 +127,6 @@ class Source(Protocol):
                 event = next(self._left, None)
                 self.ended = event is None
                 return event
-
-            def __enter__(self) -> Self:
-                return self
-
-            def __exit__(self, *_: object) -> None:
-                pass
     """
 
     @property
@@ -152,19 +148,12 @@ class Source(Protocol):
         """Return the next event; None if none comes within `timeout_s` [s] or the source ended."""
         ...
 
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-
-class NothingToClose:
-    """Context manager of a source or sink that holds nothing to close."""
-
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Do nothing."""
+        """Close the source; by default there is nothing to close."""
+        return
 
 
 class Commander(Source, Protocol):
@@ -191,18 +180,12 @@ class Sink(Protocol):
     in the order of the stream. `put` must not block: an answer comes with every reading. After
     each call `trouble` is read, and the user is told when it changes::
 
-        class Printed:
+        class Printed(Sink):
             trouble = ""
 
             def put(self, item: Item) -> None:
                 if isinstance(item, Answer) and item.diagnosis is not None:
                     print(item.time, item.diagnosis.verdict)
-
-            def __enter__(self) -> Self:
-                return self
-
-            def __exit__(self, *_: object) -> None:
-                pass
     """
 
     @property
@@ -214,59 +197,68 @@ class Sink(Protocol):
         """Take an item. If the far side is gone, set `trouble` and raise nothing."""
         ...
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> Self:
+        return self
 
-    def __exit__(self, *_: object) -> None: ...
+    def __exit__(self, *_: object) -> None:
+        """Close the sink; by default there is nothing to close."""
+        return
 
-
-# Queue between the thread of a link and a consumer that may be slow.
 
 CAPACITY = 1000
 """Maximum number of waiting events: 100 s of a robot that is read at 10 Hz."""
 
 
-class EventQueue:
-    """Bounded queue of events.
+class Link(Source):
+    """Source that other threads fill, and that its consumer may poll slowly.
 
-    A full queue drops its oldest reading: a lost reading costs little, but a lost command would
+    A full link drops its oldest reading: a lost reading costs little, but a lost command would
     make a healthy robot look faulty.
 
     Args:
-        capacity: Maximum number of events.
-
-    Attributes:
-        received: Number of events put in.
-        dropped: Number of events dropped.
+        name: Name for messages to the user.
+        capacity: Maximum number of waiting events.
     """
 
-    def __init__(self, capacity: int = CAPACITY) -> None:
+    name, ended = "", False
+
+    def __init__(self, name: str, capacity: int = CAPACITY) -> None:
+        self.name = name
         self._capacity = capacity
-        self._events: deque[Event] = deque()
-        self._filled = Condition()
-        self.dropped = 0
-        self.received = 0
+        self._waiting: deque[Event] = deque()
+        self._changed = Condition()
+        self._counts = LinkCounts()
+
+    @property
+    def counts(self) -> LinkCounts:
+        """Counters since the link was opened."""
+        return self._counts
 
     def put(self, event: Event) -> None:
         """Add an event; never blocks."""
-        with self._filled:
-            if len(self._events) >= self._capacity:
-                readings = (i for i, kept in enumerate(self._events) if isinstance(kept, Reading))
-                del self._events[next(readings, 0)]
-                self.dropped += 1
-            self._events.append(event)
-            self.received += 1
-            self._filled.notify()
+        with self._changed:
+            counts, full = self._counts, len(self._waiting) >= self._capacity
+            if full:
+                readings = (i for i, kept in enumerate(self._waiting) if isinstance(kept, Reading))
+                del self._waiting[next(readings, 0)]
+            self._waiting.append(event)
+            self._counts = replace(
+                counts, received=counts.received + 1, dropped=counts.dropped + full
+            )
+            self._changed.notify()
 
-    def get(self, timeout_s: float) -> Event | None:
-        """Return the oldest event, None if none comes within `timeout_s` [s]."""
-        with self._filled:
-            if not self._events:
-                self._filled.wait(timeout_s)
-            return self._events.popleft() if self._events else None
+    def put_garbage(self, error: str) -> None:
+        """Count an invalid message, which is left out."""
+        with self._changed:
+            garbage = self._counts.garbage + 1
+            self._counts = replace(self._counts, garbage=garbage, last_garbage=error)
 
-    def __len__(self) -> int:
-        """Return the number of waiting events."""
-        return len(self._events)
+    def poll(self, timeout_s: float) -> Event | None:
+        """Return the oldest event; None if none comes within `timeout_s` [s]."""
+        with self._changed:
+            if not self._waiting:
+                self._changed.wait(timeout_s)
+            return self._waiting.popleft() if self._waiting else None
 
 
 # Sources that users have written.
@@ -290,15 +282,12 @@ def source_from_text(text: str, robot: Robot) -> Source:
     name, *address = rest.split(":", 1)
     try:
         made = getattr(import_module(module), name)(robot, *address)
+        lacking = [part for part in SOURCE_PARTS if not hasattr(made, part)]
+        if lacking:
+            raise AttributeError(f"lacks {', '.join(lacking)}")
     except (ImportError, AttributeError) as error:
         raise InputError(
             f"source {text!r}: {error}. Expected MODULE:CLASS, a class such as the docstring of "
             "failuretwin.connection.links.base.Source shows, in a module that Python finds."
         ) from error
-    lacking = [part for part in SOURCE_PARTS if not hasattr(made, part)]
-    if lacking:
-        raise InputError(
-            f"source {text!r}: lacks {', '.join(lacking)}. Expected a class such as the docstring "
-            "of failuretwin.connection.links.base.Source shows."
-        )
     return cast(Source, made)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO, Self, cast
 
 from failuretwin import __version__
-from failuretwin.connection.links.base import Answer, CommandSent, Item
+from failuretwin.connection.links.base import Answer, CommandSent, Item, Sink
 from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosWriter
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.connection.links.ros_transport import Outgoing, RosCodec
@@ -33,56 +33,17 @@ RETRY_S = 5.0
 """Time between two attempts to write when the disk is full [s]."""
 MOST_WAITING_BYTES = 10_000_000
 """Most memory for diagnoses while the disk is full: about three hours at one a second."""
+SPARE_BYTES = 1_000_000
+"""Memory beyond that for the chunk and the index that are written last."""
 
 
-class _PatientFile:
-    """File that keeps in memory what the disk does not take yet.
-
-    Args:
-        path: The file; it must not exist.
-
-    Raises:
-        InputError: If it exists.
-        OSError: If it cannot be created.
-    """
-
-    def __init__(self, path: Path) -> None:
-        try:
-            self._file = path.open("xb", buffering=0)
-        except FileExistsError as error:
-            raise _exists(path) from error
-        self._written = 0
-        self._waiting = bytearray()
-
-    def write(self, data: bytes) -> None:
-        """Take bytes; the disk gets them with the next `save`."""
-        self._waiting += data
-        self._written += len(data)
-
-    def tell(self) -> int:
-        """Return the number of bytes taken."""
-        return self._written
-
-    def flush(self) -> None:
-        """Do nothing: `save` writes."""
-
-    @property
-    def waiting(self) -> int:
-        """Number of bytes that are not on the disk."""
-        return len(self._waiting)
-
-    def save(self) -> None:
-        """Write the waiting bytes; raises OSError and keeps them if the disk is full or gone."""
-        while self._waiting:
-            del self._waiting[: self._file.write(self._waiting)]
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+def _check_new(path: Path) -> None:
+    if path.exists():
+        raise InputError(f"{path}: exists already. Choose another name, or remove it.")
 
 
-def _exists(path: Path) -> InputError:
-    return InputError(f"{path}: exists already. Choose another name, or remove it.")
+def _unwritten(path: Path, error: OSError) -> OutputError:
+    return OutputError(f"{path}: cannot be written ({error.strerror}).")
 
 
 def write_bag(path: Path, robot: Robot, commands: Sequence[CommandSent]) -> None:
@@ -99,8 +60,7 @@ def write_bag(path: Path, robot: Robot, commands: Sequence[CommandSent]) -> None
     """
     with needs_extra("bags need rosbags", "files"):
         from rosbags.rosbag1 import Writer
-    if path.exists():
-        raise _exists(path)
+    _check_new(path)
     codec, writer = RosCodec(1), RosWriter(robot, RECORDED)
     definition, md5 = codec.definition(RECORDED.command_type)
     type_ = codec.full_name(RECORDED.command_type)
@@ -111,10 +71,10 @@ def write_bag(path: Path, robot: Robot, commands: Sequence[CommandSent]) -> None
                 data = codec.encode(writer.command(command))
                 bag.write(topic, round(command.time * NS_PER_S), data)
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror}).") from error
+        raise _unwritten(path, error) from error
 
 
-class Recorder:
+class Recorder(Sink):
     """Sink that records readings, commands and answers as MCAP.
 
     If the disk is full or gone, diagnoses wait in memory, readings and commands are dropped, and
@@ -129,27 +89,29 @@ class Recorder:
         OutputError: If it cannot be written.
     """
 
+    trouble = ""
+
     def __init__(self, path: Path, robot: Robot) -> None:
         with needs_extra("recording needs mcap and rosbags", "live"):
             from mcap.writer import Writer
         if path.suffix != ".mcap":
             raise InputError(f"{path}: recordings are MCAP. Give a name that ends in .mcap.")
-        self.trouble = ""
+        _check_new(path)
         self._path = path
         self._codec = RosCodec(2)
         self._robot_writer = RosWriter(robot, RECORDED)
         self._diagnostics = DiagnosticsWriter(robot, RECORDED)
         self._channels: dict[str, int] = {}
-        self._retry_s = 0.0
-        try:
-            self._file = _PatientFile(path)
+        self._saved, self._retry_s = 0, 0.0
+        try:  # a buffer keeps what the disk does not take, until `_save` succeeds
+            self._file = path.open("xb", buffering=MOST_WAITING_BYTES + SPARE_BYTES)
         except OSError as error:
-            raise OutputError(f"{path}: cannot be written ({error.strerror}).") from error
-        self._mcap = Writer(cast(BinaryIO, self._file), chunk_size=CHUNK_BYTES)
+            raise _unwritten(path, error) from error
+        self._mcap = Writer(self._file, chunk_size=CHUNK_BYTES)
         self._mcap.start(profile="ros2", library=f"failuretwin {__version__}")
         self._save()
         if self.trouble:
-            self._file.close()
+            self._close()
             path.unlink()
             raise OutputError(f"{self.trouble}.")
 
@@ -158,19 +120,29 @@ class Recorder:
         messages = self._diagnostics.messages(item)
         if not self.trouble:
             messages += [*self._robot_writer.messages(item), *_probabilities(item)]
-        if self._file.waiting < MOST_WAITING_BYTES:
+        if self._file.tell() - self._saved < MOST_WAITING_BYTES:
             for message in messages:
                 self._write(message, round(item.time * NS_PER_S))
         if time.monotonic() >= self._retry_s:
             self._save()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self._mcap.finish()  # type: ignore[no-untyped-call]
         self._save()
-        self._file.close()
+        self._close()
+
+    def _save(self) -> None:
+        try:
+            self._file.flush()
+        except OSError as error:
+            self.trouble = str(_unwritten(self._path, error)).removesuffix(".")
+            self._retry_s = time.monotonic() + RETRY_S
+        else:
+            self.trouble, self._saved = "", self._file.tell()
+
+    def _close(self) -> None:
+        with suppress(OSError):  # the user knows from `trouble` that the disk is full
+            self._file.close()
 
     def _write(self, message: Outgoing, time_ns: int) -> None:
         if message.topic not in self._channels:
@@ -183,15 +155,6 @@ class Recorder:
         definition, _ = self._codec.definition(message.type)
         schema = self._mcap.register_schema(name, "ros2msg", definition.encode())
         return self._mcap.register_channel(message.topic, "cdr", schema)
-
-    def _save(self) -> None:
-        try:
-            self._file.save()
-        except OSError as error:
-            self.trouble = f"{self._path}: cannot be written ({error.strerror})"
-            self._retry_s = time.monotonic() + RETRY_S
-        else:
-            self.trouble, self._retry_s = "", 0.0
 
 
 def _probabilities(item: Item) -> list[Outgoing]:

@@ -9,17 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from failuretwin.connection.links.base import (
-    CommandSent,
-    Event,
-    LinkCounts,
-    NothingToClose,
-    Reading,
-)
-from failuretwin.connection.links.ros_messages import SampledCommands, goal_reading, motor_reading
+from failuretwin.connection.links.base import CommandSent, Event, LinkCounts, Reading, Source
+from failuretwin.connection.links.ros_messages import SampledCommands, motor_reading
+from failuretwin.connection.links.stream_time import order
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import GOAL_VARIABLE
-from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.bag_file import is_bag
 from failuretwin.data_knowledge.readers.bag_messages import BagTopics
 from failuretwin.data_knowledge.readers.bags import read_bag
@@ -72,7 +66,14 @@ class Pace:
         return left <= timeout_s
 
 
-class PacedSource(NothingToClose):
+@dataclass(frozen=True)
+class Wait:
+    """A time [s] until which the event after it is not asked for."""
+
+    time: float
+
+
+class PacedSource(Source):
     """Source that gives events when they are due and drops none.
 
     Args:
@@ -81,30 +82,26 @@ class PacedSource(NothingToClose):
         pace: Clock of the events.
     """
 
-    def __init__(self, name: str, events: Iterator[Event], pace: Pace) -> None:
+    name, ended, counts = "", False, LinkCounts()
+
+    def __init__(self, name: str, events: Iterator[Event | Wait], pace: Pace) -> None:
         self.name = name
-        self.ended = False
         self._events = events
         self._pace = pace
-        self._next: Event | None = None
-        self._received = 0
-
-    @property
-    def counts(self) -> LinkCounts:
-        """Number of events given so far."""
-        return LinkCounts(received=self._received)
+        self._next: Event | Wait | None = None
 
     def poll(self, timeout_s: float) -> Event | None:
         """Return the next event; None if it is not due within `timeout_s` [s] or there is none."""
-        if self._next is None and not self.ended:
-            self._next = next(self._events, None)
-            self.ended = self._next is None
-        event = self._next
-        if event is None or not self._pace.due(event.time, timeout_s):
-            return None
-        self._next = None
-        self._received += 1
-        return event
+        while (item := self._next or next(self._events, None)) is not None:
+            self._next = item
+            if not self._pace.due(item.time, timeout_s):
+                return None
+            self._next = None
+            if not isinstance(item, Wait):
+                self.counts = LinkCounts(received=self.counts.received + 1)
+                return item
+        self.ended = True
+        return None
 
 
 def replay(path: Path, robot: Robot, pace: Pace, topics: BagTopics | None = None) -> PacedSource:
@@ -135,35 +132,28 @@ def replay(path: Path, robot: Robot, pace: Pace, topics: BagTopics | None = None
 
 def session_events(session: RawSession, robot: Robot) -> Iterator[Event]:
     """Yield the commands and readings of a raw session in the order of their stamps."""
-    units = robot.servo_units
-    counts = session.reading_counts
+    units, counts = robot.servo_units, session.reading_counts
     angle = np.where(units.valid(counts), units.to_rad(counts), np.nan)
-    target = units.to_rad(session.target_counts)
-    commands = [
-        CommandSent(float(time), target[i], session.ramp_s[i])
-        for i, time in enumerate(session.command_time)
-    ]
-    return _in_order([*commands, *_motor_readings(session.reading_time, angle, robot)])
+    command = Targets(session.command_time, units.to_rad(session.target_counts), session.ramp_s)
+    position = Samples(session.reading_time, angle)
+    return log_events(TimedLog(session.name, command, position=position), robot)
 
 
 def log_events(log: TimedLog, robot: Robot) -> Iterator[Event]:
     """Yield the commands and readings of a log in the order of their times."""
-    goals = log.sensors.get(GOAL_VARIABLE)
     events: list[Event] = list(_commands(log.command))
+    goals, twin = log.sensors.get(GOAL_VARIABLE), DigitalTwin(robot)
     if log.tool is not None:
         events += map(Reading, log.tool.time.tolist(), log.tool.value)
     elif log.position is not None:
-        events += _motor_readings(log.position.time, log.position.value, robot)
+        rows = zip(log.position.time.tolist(), log.position.value, strict=True)
+        events += [motor_reading(time, angle, twin) for time, angle in rows]
     else:
         raise InputError(f"{log.name}: holds neither a tool path nor motor readings.")
     if goals is not None:
-        events += map(goal_reading, goals.time.tolist(), goals.value)
-    return _in_order(events)
-
-
-def _motor_readings(time: FloatArray, angle: FloatArray, robot: Robot) -> list[Reading]:
-    twin = DigitalTwin(robot)
-    return [motor_reading(float(t), row, twin) for t, row in zip(time, angle, strict=True)]
+        reported = zip(goals.time.tolist(), goals.value, strict=True)
+        events += [Reading(time, goal=goal) for time, goal in reported]
+    return iter(sorted(events, key=order))
 
 
 def _commands(command: Samples | Targets) -> Iterator[CommandSent]:
@@ -175,8 +165,3 @@ def _commands(command: Samples | Targets) -> Iterator[CommandSent]:
         sent = samples.add(stamp, value) if np.isfinite(value).all() else None
         if sent is not None:
             yield sent
-
-
-def _in_order(events: list[Event]) -> Iterator[Event]:
-    """Yield events in the order of their times, a command before a reading of the same time."""
-    return iter(sorted(events, key=lambda event: (event.time, isinstance(event, Reading))))

@@ -10,47 +10,39 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Sequence
-from functools import cache, partial
-from http.client import HTTPConnection, HTTPException
-from importlib.machinery import ModuleSpec, PathFinder
-from pathlib import Path
-from types import ModuleType
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.client import HTTPConnection
+from itertools import chain
 from typing import Any
-from xmlrpc.client import Error, ServerProxy
+from xmlrpc.client import ServerProxy
 from xmlrpc.client import Transport as HttpTransport
 
-from failuretwin.connection.links.ros_transport import (
-    Outgoing,
-    RosCodec,
-    Take,
-    Transport,
-    kind_in,
-    wait_for_listener,
-)
+from failuretwin.connection.links.ros_transport import Outgoing, RosCodec, Take, Transport
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.readers.bag_messages import Kind
-
-# Import of rospy. Debian installs it for its own interpreter, next to its own numpy. A virtual
-# environment must not see that whole folder, so an import hook admits the modules of ROS alone.
 
 DEBIAN_FOLDER = "/usr/lib/python3/dist-packages"
-ROS_MODULES = (
-    *("catkin", "catkin_pkg", "defusedxml", "distro", "netifaces", "rospkg", "six", "yaml"),
-    *("genmsg", "genpy", "roscpp", "rosgraph", "rosgraph_msgs", "roslib", "rospy", "std_msgs"),
-)
-"""Modules of rospy and those that it needs; taken from Debian if found nowhere else."""
+"""Where Debian installs rospy, next to its own numpy and all else that it has of Python."""
+NODE = "failuretwin"
+DEFAULT_URI = "http://localhost:11311"
+TIMEOUT_S = 2.0
+"""Longest wait for an answer of the master [s]."""
+CHECK_S = 1.0
+"""Time between two questions to the master [s]."""
+QUEUE = 100
+"""Maximum number of messages that wait for a slow listener; rospy drops the oldest."""
+QUIET_LOGS = ("rospy", "rosout", "rosgraph", "rospy.internal", "rospy.topics", "rospy.registration")
 
 
-class _DebianRos:
-    """Import hook that finds the modules of ROS in Debian's folder."""
-
-    def find_spec(
-        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        if path is not None or name not in ROS_MODULES:
-            return None
-        return PathFinder.find_spec(name, [DEBIAN_FOLDER], target)
+@contextmanager
+def _debian_folder() -> Iterator[None]:
+    """Let Python find Debian's modules, after all others, for as long as rospy is imported."""
+    before = [*sys.path]
+    sys.path.append(DEBIAN_FOLDER)
+    try:
+        yield
+    finally:
+        sys.path[:] = before
 
 
 def load_rospy() -> Any:
@@ -59,26 +51,15 @@ def load_rospy() -> Any:
     Raises:
         InputError: If it is not installed or cannot be imported.
     """
-    hooked = any(isinstance(finder, _DebianRos) for finder in sys.meta_path)
-    if not hooked and Path(DEBIAN_FOLDER, "rospy").is_dir():
-        sys.meta_path.append(_DebianRos())
     try:
-        import rospy
+        with _debian_folder():
+            import rospy
     except ImportError as error:
         raise InputError(
             f"ROS 1 needs rospy, which cannot be imported ({error}). With Debian's packages: `apt "
             "install python3-rospy`; with others, source their setup file first (docs/live.md)."
         ) from error
     return rospy
-
-
-# The ROS master.
-
-NODE = "failuretwin"
-DEFAULT_URI = "http://localhost:11311"
-TIMEOUT_S = 2.0
-"""Longest wait for an answer of the master [s]."""
-QUIET_LOGS = ("rospy", "rosout", "rosgraph", "rospy.internal", "rospy.topics", "rospy.registration")
 
 
 class _TimedHttp(HttpTransport):
@@ -88,19 +69,19 @@ class _TimedHttp(HttpTransport):
         return connection
 
 
-def _ask_master(question: str) -> Any:
-    """Return the answer to a call of the master's XML-RPC interface.
+def _call(uri: str, method: str, *args: object) -> Any:
+    """Return the answer to an XML-RPC call of the master or a node.
 
     Raises:
-        OSError: If no master answers.
+        Exception: Anything from socket errors to XML-RPC faults if there is no sound answer.
     """
-    uri = os.environ.get("ROS_MASTER_URI", DEFAULT_URI)
-    try:
-        with ServerProxy(uri, transport=_TimedHttp()) as master:
-            _, _, value = getattr(master, question)(f"/{NODE}")
-    except (Error, HTTPException, ValueError, TypeError) as error:
-        raise OSError(f"no valid answer from {uri}: {error}") from error
+    with ServerProxy(uri, transport=_TimedHttp()) as server:
+        _, _, value = getattr(server, method)(*args)
     return value
+
+
+def _master_uri() -> str:
+    return os.environ.get("ROS_MASTER_URI", DEFAULT_URI)
 
 
 def _join() -> Any:
@@ -113,42 +94,21 @@ def _join() -> Any:
     if rospy.core.is_initialized():
         return rospy
     try:
-        _ask_master("getPid")
-    except OSError as error:
+        _call(_master_uri(), "getPid", f"/{NODE}")
+    except Exception as error:
         address = os.environ.get("ROS_MASTER_URI", "not set")
         raise InputError(
             f"no ROS master answers ({error}; ROS_MASTER_URI is {address}). Start `roscore`, or "
             "set ROS_MASTER_URI to where it runs."
         ) from error
     quiet = {"disable_signals": True, "disable_rosout": True, "disable_rostime": True}
-    rospy.init_node(NODE, argv=[], anonymous=True, **quiet)
+    with _debian_folder():
+        rospy.init_node(NODE, argv=[], anonymous=True, **quiet)
+        # rospy would import netifaces for this only later; it keeps the answer.
+        rospy.core.rosgraph.network.get_local_addresses()
     for name in QUIET_LOGS:  # the transport itself reports a master that is gone
         logging.getLogger(name).setLevel(logging.CRITICAL)
     return rospy
-
-
-# Messages: received with the definition that their publisher sends along, sent as bytes.
-
-
-def _decoded(message: Any) -> tuple[Any, Kind]:
-    """Return a `rospy.AnyMsg` as an object with the fields of its kind, and its kind.
-
-    Raises:
-        InputError: If it is of no known kind.
-        Exception: Any error of rosbags if the bytes do not fit the definition.
-    """
-    header = message._connection_header
-    store, type_, kind = _defined_type(header["type"], header["message_definition"])
-    return store.deserialize_ros1(message._buff, type_), kind
-
-
-@cache
-def _defined_type(name: str, definition: str) -> tuple[Any, str, Kind]:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store, type_ = get_typestore(Stores.EMPTY), name.replace("/", "/msg/")
-    store.register(get_types_from_msg(definition, type_))
-    return store, type_, kind_in(store, type_)
 
 
 def message_class(codec: RosCodec, type_: str) -> Any:
@@ -158,76 +118,59 @@ def message_class(codec: RosCodec, type_: str) -> Any:
     return type("Message", (load_rospy().AnyMsg,), described)
 
 
-# The transport.
-
-CHECK_S = 1.0
-"""Time between two questions to the master [s]."""
-QUEUE = 100
-"""Maximum number of messages that wait for a slow listener; rospy drops the oldest."""
-
-
 class Ros1Transport(Transport):
     """Node of ROS 1, at the master in ``ROS_MASTER_URI``.
 
-    Messages are known by their fields, whatever package they come from.
+    Messages are known by their fields, whatever package they come from. While the master is gone,
+    no new listeners come.
 
     Raises:
         InputError: If rospy or rosbags is missing, or no master answers.
     """
 
-    name = "ROS 1"
+    name, far_side = "ROS 1", "ROS master"
 
     def __init__(self) -> None:
         self._codec = RosCodec(1)
         self._rospy = _join()
-        self._takes: list[tuple[str, Take]] = []
-        self._classes: dict[str, Any] = {}
         self._subscribers: list[Any] = []
         self._publishers: dict[str, Any] = {}
-        self._master_gone, self._renewals = False, 0
+        self._gone = False
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="ROS registration", daemon=True)
         self._thread.start()
 
-    @property
-    def trouble(self) -> str:
-        """Whether the master is gone, so that no new listeners come."""
-        return "the ROS master is gone" if self._master_gone else ""
+    def is_gone(self) -> bool:
+        """Return whether the master did not answer when it was last asked."""
+        return self._gone
 
-    @property
-    def reconnects(self) -> int:
-        """Number of times that the master went away and came back."""
-        return self._renewals
+    def is_heard(self, topic: str) -> bool:
+        """Return whether another process listens to an advertised topic."""
+        node, links = self._rospy.get_name(), self._publishers[topic].impl.connections
+        return any(link.endpoint_id != node for link in links)
 
     def subscribe(self, topic: str, type_: str, take: Take) -> None:
         """Call `take` with every message of a topic, of any type."""
-        self._subscribers.append(self._subscriber(topic, take))
-        self._takes.append((topic, take))
+
+        def receive(message: Any) -> None:
+            header = message._connection_header
+            described = header["type"], header["message_definition"]
+            take(lambda: self._codec.decode(message._buff, *described))
+
+        subscriber, any_type = self._rospy.Subscriber, self._rospy.AnyMsg
+        self._subscribers.append(subscriber(topic, any_type, receive, tcp_nodelay=True))
 
     def advertise(self, topic: str, type_: str) -> None:
         """Prepare a topic for publishing."""
-        class_ = message_class(self._codec, type_)
-        self._publishers[topic] = self._publisher(topic, class_)
-        self._classes[topic] = class_
+        publisher, class_ = self._rospy.Publisher, message_class(self._codec, type_)
+        self._publishers[topic] = publisher(topic, class_, queue_size=QUEUE, tcp_nodelay=True)
 
     def publish(self, message: Outgoing) -> None:
         """Publish a message."""
-        content = self._classes[message.topic]()
+        publisher = self._publishers[message.topic]
+        content = publisher.data_class()
         content._buff = self._codec.encode(message)
-        try:
-            self._publishers[message.topic].publish(content)
-        except self._rospy.ROSException:  # it is being registered again
-            return
-
-    def check_listener(self, topic: str) -> None:
-        """Wait for a listener in another process; raises InputError if there is none in time."""
-        node = self._rospy.get_name()
-
-        def listening() -> bool:
-            links = self._publishers[topic].impl.connections
-            return any(link.endpoint_id != node for link in links)
-
-        wait_for_listener(topic, listening)
+        publisher.publish(content)
 
     def close(self) -> None:
         """End all subscriptions and publishers; the process stays a node."""
@@ -236,44 +179,28 @@ class Ros1Transport(Transport):
         for handle in (*self._subscribers, *self._publishers.values()):
             handle.unregister()
 
-    def _subscriber(self, topic: str, take: Take) -> Any:
-        def receive(message: Any) -> None:
-            take(partial(_decoded, message))
-
-        return self._rospy.Subscriber(topic, self._rospy.AnyMsg, receive, tcp_nodelay=True)
-
-    def _publisher(self, topic: str, class_: Any) -> Any:
-        return self._rospy.Publisher(topic, class_, queue_size=QUEUE, tcp_nodelay=True)
-
     def _watch(self) -> None:
         while not self._stop.wait(CHECK_S):
             try:
-                if self._is_forgotten():
-                    self._register_again()
-                self._master_gone = False
-            # While a master starts, rospy raises anything from socket errors to XML-RPC faults. The
-            # next question comes in a second.
+                self._register_if_forgotten()
+                self._gone = False
+            # While a master starts, it answers with anything from socket errors to XML-RPC faults.
+            # The next question comes in a second.
             except Exception:
-                self._master_gone = True
+                self._gone = True
 
-    def _is_forgotten(self) -> bool:
-        """Return whether the master has forgotten a topic; raises OSError if none answers."""
-        published, subscribed, _ = _ask_master("getSystemState")
-        own, name = self._rospy.get_name(), self._rospy.resolve_name
-        for registered, topics in (
-            (published, list(self._classes)),
-            (subscribed, [topic for topic, _ in self._takes]),
-        ):
-            known = {topic for topic, nodes in registered if own in nodes}
-            if not known >= set(map(name, topics)):
-                return True
-        return False
-
-    def _register_again(self) -> None:
-        for handle in self._subscribers:
-            handle.unregister()
-        self._subscribers = [self._subscriber(topic, take) for topic, take in self._takes]
-        for topic, class_ in list(self._classes.items()):
-            self._publishers[topic].unregister()
-            self._publishers[topic] = self._publisher(topic, class_)
-        self._renewals += 1
+    def _register_if_forgotten(self) -> None:
+        """Tell the master of all topics if it lacks one, and hear from it who publishes them."""
+        node, uri, master = self._rospy.get_name(), self._rospy.get_node_uri(), _master_uri()
+        topics = self._rospy.impl.registration.get_topic_manager()
+        with topics.lock:
+            published, subscribed = topics.get_publications(), topics.get_subscriptions()
+        state = chain.from_iterable(_call(master, "getSystemState", node))
+        known = {topic for topic, nodes in state if node in nodes}
+        if known >= {topic for topic, _ in (*published, *subscribed)}:
+            return
+        for topic, type_ in published:
+            _call(master, "registerPublisher", node, topic, type_, uri)
+        for topic, type_ in subscribed:
+            publishers = _call(master, "registerSubscriber", node, topic, type_, uri)
+            _call(uri, "publisherUpdate", "/master", topic, publishers)

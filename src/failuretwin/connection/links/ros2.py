@@ -19,13 +19,7 @@ import time
 import uuid
 from typing import Any
 
-from failuretwin.connection.links.ros_transport import (
-    Outgoing,
-    RosCodec,
-    Take,
-    Transport,
-    wait_for_listener,
-)
+from failuretwin.connection.links.ros_transport import Outgoing, RosCodec, Take, Transport
 from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.data_knowledge.readers.bag_messages import NS_PER_S
 
@@ -60,16 +54,10 @@ def _open_session(host: str, port: int) -> Any:
     """
     with needs_extra("ROS 2 needs eclipse-zenoh", "ros2"):
         import zenoh
-    config, endpoint = zenoh.Config(), f"tcp/{host}:{port}"
-    settings = {
-        "mode": "client",
-        "connect/endpoints": [endpoint],
-        "scouting/multicast/enabled": False,
-    }
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
+    endpoint, alone = f"tcp/{host}:{port}", {"multicast": {"enabled": False}}
+    settings = {"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": alone}
     try:
-        return zenoh.open(config)
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
     except zenoh.ZError as error:
         raise InputError(
             f"no Zenoh router answers at {endpoint}. Start one there: `ros2 run rmw_zenoh_cpp "
@@ -91,6 +79,8 @@ class Ros2Transport(Transport):
         InputError: If an extra is missing, ``ROS_DOMAIN_ID`` is invalid, or no router answers.
     """
 
+    far_side = "Zenoh router"
+
     def __init__(self, host: str = "localhost", port: int = ROUTER_PORT) -> None:
         self._domain = domain_id()
         self.name = f"ROS 2, domain {self._domain}"
@@ -99,36 +89,34 @@ class Ros2Transport(Transport):
         self._gid, self._sent = uuid.uuid4().bytes, 0
         self._publishers: dict[str, Any] = {}
         self._declared: list[Any] = []
-        self._gone, self._reconnects = False, 0
 
-    @property
-    def trouble(self) -> str:
-        """Whether the router is gone."""
-        return "the Zenoh router is gone" if self._router_gone() else ""
+    def is_gone(self) -> bool:
+        """Return whether the router is gone."""
+        return self._session.is_closed() or not self._session.info.routers_zid()
 
-    @property
-    def reconnects(self) -> int:
-        """Number of times that the router was seen to go away and come back."""
-        gone = self._router_gone()
-        self._reconnects += self._gone and not gone
-        self._gone = gone
-        return self._reconnects
+    def is_heard(self, topic: str) -> bool:
+        """Return whether another session listens to an advertised topic."""
+        return bool(self._publishers[topic].matching_status.matching)
 
     def subscribe(self, topic: str, type_: str, take: Take) -> None:
         """Call `take` with every message of a topic, whatever its type and hash."""
 
         def receive(sample: Any) -> None:
             name = _unmangled(str(sample.key_expr).split("/")[-2])
-            take(lambda: self._codec.decode(name, bytes(sample.payload)))
+            take(lambda: self._codec.decode(bytes(sample.payload), name))
 
         key = f"{self._domain}/{topic.lstrip('~/')}/*/*"
         self._declared.append(self._session.declare_subscriber(key, receive))
 
     def advertise(self, topic: str, type_: str) -> None:
         """Declare a publisher, and the liveliness tokens by which ROS 2 knows it."""
+        import zenoh
+
         name, hash_ = topic.lstrip("~/"), self._codec.hash_of(type_)
         key = f"{self._domain}/{name}/{_mangled(type_)}/{hash_}"
-        self._publishers[topic] = self._session.declare_publisher(key)
+        # This publisher tells whether others listen. What it sends would not come back to us.
+        others = zenoh.Locality.REMOTE
+        self._publishers[topic] = self._session.declare_publisher(key, allowed_destination=others)
         alive = f"@ros2_lv/{self._domain}/{self._session.zid()}/0"
         number = len(self._publishers)
         known = f"%{name.replace('/', '%')}/{_mangled(type_)}/{hash_}/{QOS}"
@@ -142,24 +130,12 @@ class Ros2Transport(Transport):
         self._sent += 1
         now_ns = round(time.time() * NS_PER_S)
         attached = struct.pack("<qqB", self._sent, now_ns, len(self._gid)) + self._gid
-        self._publishers[message.topic].put(self._codec.encode(message), attachment=attached)
-
-    def check_listener(self, topic: str) -> None:
-        """Wait for a listener in another session; raises InputError if there is none in time."""
-        import zenoh
-
-        key, remote = self._publishers[topic].key_expr, zenoh.Locality.REMOTE
-        with self._session.declare_publisher(key, allowed_destination=remote) as probe:
-            wait_for_listener(topic, lambda: probe.matching_status.matching)
+        key = self._publishers[message.topic].key_expr
+        self._session.put(key, self._codec.encode(message), attachment=attached)
 
     def close(self) -> None:
-        """End all subscriptions and publishers, and the session."""
-        for declared in (*self._publishers.values(), *self._declared):
-            declared.undeclare()
+        """Close the session, and with it all subscriptions and publishers."""
         self._session.close()
-
-    def _router_gone(self) -> bool:
-        return self._session.is_closed() or not self._session.info.routers_zid()
 
 
 def _mangled(type_: str) -> str:

@@ -6,19 +6,19 @@ Networks are named as on the command line: ``ros1``, ``ros2``, ``rosbridge://HOS
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import partial
-from threading import Lock
 from urllib.parse import urlsplit
 
 from failuretwin.connection.links.base import (
     CommandSent,
     Event,
-    EventQueue,
     Item,
+    Link,
     LinkCounts,
-    NothingToClose,
     Order,
     Reading,
+    Sink,
 )
 from failuretwin.connection.links.ros1 import Ros1Transport
 from failuretwin.connection.links.ros2 import ROUTER_PORT, Ros2Transport
@@ -48,56 +48,32 @@ def open_transport(text: str) -> Transport:
     """
     if text == ROS1:
         return Ros1Transport()
-    if text == ROS2:
-        return Ros2Transport()
-    if text.startswith(f"{ROS2}://"):
-        return Ros2Transport(*address_of(text, ROUTER_PORT))
-    return RosbridgeTransport(*address_of(text, BRIDGE_PORT))
-
-
-def address_of(text: str, usual_port: int) -> tuple[str, int]:
-    """Return host and port of an address such as ``rosbridge://HOST[:PORT]``.
-
-    Raises:
-        InputError: If it is not an address.
-    """
+    kind = text.partition("://")[0]
     try:
-        address = urlsplit(text)
-        host, port = address.hostname, address.port or usual_port
+        address = urlsplit(f"{ROS2}://localhost" if text == ROS2 else text)
+        host, port = address.hostname, address.port
     except ValueError:
-        host, port = None, 0
+        host, port = None, None
     if not host:
-        kind = text.partition("://")[0]
         raise InputError(f"{text!r} is no address. Expected {kind}://HOST[:PORT].")
-    return host, port
+    if kind == ROS2:
+        return Ros2Transport(host, port or ROUTER_PORT)
+    return RosbridgeTransport(host, port or BRIDGE_PORT)
 
 
-# Links.
-
-
-class RosSource(NothingToClose):
-    """Source of readings and commands on a ROS network; it does not close the transport.
+class RosSource(Link):
+    """Readings and commands of a robot on a ROS network; it does not close the transport.
 
     Invalid messages are counted and left out.
-
-    Args:
-        robot: The robot.
-        topics: Its topics.
-        transport: Connection to the network.
 
     Raises:
         InputError: If messages hold servo counts and the robot's profile has none.
     """
 
-    ended = False
-
     def __init__(self, robot: Robot, topics: RosTopics, transport: Transport) -> None:
         topics.check_fits(robot)
-        self.name = f"{transport.name}: {', '.join(name for _, name, _ in topics.subscribed)}"
+        super().__init__(f"{transport.name}: {', '.join(name for _, name, _ in topics.subscribed)}")
         self._transport = transport
-        self._queue = EventQueue()
-        self._lock = Lock()
-        self._garbage, self._last_garbage = 0, ""
         for role, topic, type_ in topics.subscribed:
             reader = RosReader(robot, role, topics)
             transport.subscribe(topic, type_, partial(self._take, reader))
@@ -105,41 +81,25 @@ class RosSource(NothingToClose):
     @property
     def counts(self) -> LinkCounts:
         """Counters since the source was opened."""
-        queue, refusals = self._queue, self._transport.refusals
-        return LinkCounts(
-            received=queue.received,
-            garbage=self._garbage + len(refusals),
-            dropped=queue.dropped,
-            reconnects=self._transport.reconnects,
-            last_garbage=refusals[-1] if refusals else self._last_garbage,
-        )
-
-    def poll(self, timeout_s: float) -> Event | None:
-        """Return the next event; None if none comes within `timeout_s` [s]."""
-        return self._queue.get(timeout_s)
+        return replace(self._counts, reconnects=self._transport.reconnects)
 
     def _take(self, reader: RosReader, decode: Decode) -> None:
         received_ns = time.time_ns()
-        with self._lock:  # a transport may have one thread per publisher
+        with self._changed:  # a transport may have one thread per publisher
             try:
                 events = reader.events(*decode(), received_ns)
             # Anyone may publish anything here, and invalid bytes raise errors of struct, numpy or
             # rosbags. The message is counted; the next one may be valid.
             except Exception as error:
-                self._garbage += 1
-                self._last_garbage = f"{type(error).__name__}: {error}"
+                ours = isinstance(error, InputError)
+                self.put_garbage(str(error) if ours else f"{type(error).__name__}: {error}")
                 return
             for event in events:
-                self._queue.put(event)
+                self.put(event)
 
 
 class RosCommander(RosSource):
     """Source that also publishes orders, one message each.
-
-    Args:
-        robot: The robot.
-        topics: Its topics.
-        transport: Connection to the network.
 
     Raises:
         InputError: If messages hold servo counts and the robot's profile has none, or commands are
@@ -160,9 +120,9 @@ class RosCommander(RosSource):
         if event is not None:
             self._ahead_s = event.time - time.monotonic()
         if isinstance(event, CommandSent):
-            self._stand_at(event.target)
+            self.standing = self._writer.origin = event.target
         elif self.standing is None and isinstance(event, Reading) and event.position is not None:
-            self._writer.start_at(event.position)
+            self._writer.origin = event.position
         return event
 
     def send(self, order: Order) -> None:
@@ -175,21 +135,13 @@ class RosCommander(RosSource):
         stamp = time.monotonic() + self._ahead_s
         command = CommandSent(stamp, order.target, order.duration)
         self._transport.publish(self._writer.command(command))
-        self._stand_at(order.target)
-
-    def _stand_at(self, target: FloatArray) -> None:
-        self.standing = target
-        self._writer.start_at(target)
+        self.standing = order.target
 
 
-class RosSink(NothingToClose):
+class RosSink(Sink):
     """Sink that publishes items on a ROS network; it does not close the transport.
 
     With a `RosWriter` it plays a robot: robots that listen to its commands will move.
-
-    Args:
-        writer: Converts items into messages.
-        transport: Connection to the network.
     """
 
     def __init__(self, writer: RosWriter | DiagnosticsWriter, transport: Transport) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,15 +12,15 @@ from failuretwin.connection.links.base import Answer, CommandSent, Event, Item, 
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.connection.links.ros_transport import Outgoing
 from failuretwin.connection.links.statuses import Status, statuses
+from failuretwin.connection.links.stream_time import SHORTEST_S, Ramp
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import MS_PER_S, FloatArray
 from failuretwin.data_knowledge.readers.bag_messages import (
-    KINDS,
     NS_PER_S,
     BagMessage,
     Kind,
     Role,
-    Rows,
+    check_role,
     kind_of_type,
     topic_rows,
 )
@@ -43,13 +44,9 @@ def motor_reading(time: float, angle: FloatArray, twin: DigitalTwin) -> Reading:
         angle: (motor,) [rad], NaN where one is missing; then there is no tool position.
         twin: Kinematics of the robot.
     """
-    complete = bool(np.isfinite(angle).all())
-    return Reading(time, twin.path(angle) if complete else np.full(3, np.nan), angle)
-
-
-def goal_reading(time: float, goal: FloatArray) -> Reading:
-    """Return a reading of nothing but the goals that the motors report, (motor,) [rad]."""
-    return Reading(time, np.full(3, np.nan), goal=goal)
+    if np.isfinite(angle).all():
+        return Reading(time, twin.path(angle), angle)
+    return Reading(time, position=angle)
 
 
 class SampledCommands:
@@ -65,9 +62,7 @@ class SampledCommands:
     def add(self, time: float, value: FloatArray) -> CommandSent | None:
         """Return the command that a sample completes, None while the reference stands still.
 
-        Args:
-            time: Time of the sample [s].
-            value: The reference, (motor,) [rad].
+        Samples have a time [s] and the reference then, (motor,) [rad].
         """
         before, self._before = self._before, (time, value)
         if before is None:
@@ -78,12 +73,9 @@ class SampledCommands:
 
 
 class RosReader:
-    """Converts the messages of one topic into events.
+    """Converts the messages of the topic with one role into events.
 
-    Args:
-        robot: The robot.
-        role: Role of the topic.
-        topics: All topics. Motor readings give the tool position only if no tool topic is named.
+    Motor readings give the tool position only if no tool topic is named.
     """
 
     def __init__(self, robot: Robot, role: Role, topics: RosTopics) -> None:
@@ -91,7 +83,7 @@ class RosReader:
         self._twin = DigitalTwin(robot)
         self._role = role
         self._sees_tool = bool(topics.tool)
-        self._where = next(f"topic {name}" for r, name, _ in topics.subscribed if r == role)
+        self._where = f"topic {getattr(topics, role)}"
         self._samples = SampledCommands()
         self._target: FloatArray | None = None
 
@@ -107,46 +99,35 @@ class RosReader:
         Raises:
             InputError: If it is invalid.
         """
-        if kind not in KINDS[self._role]:
-            raise InputError(f"{self._where}: {kind.value} cannot be the {self._role}.")
+        check_role(self._role, kind, f"{self._where}: {kind.value}")
         rows = topic_rows([BagMessage(received_ns, content)], kind, self._role, self._where)
         if self._role != "tool":
             rows = motor_rows(rows, self._robot)
-        if self._role == "command":
-            return self._commands(rows)
-        return self._readings(rows.stamp_ns.tolist(), rows.value)
-
-    def _readings(self, stamps_ns: list[int], values: FloatArray) -> list[Event]:
-        checked = self._checked(values, LARGEST)
-        rows = zip(stamps_ns, checked, strict=True)
-        return [self._reading(stamp / NS_PER_S, row) for stamp, row in rows]
+        self._check(rows.value, LARGEST)
+        times = (rows.stamp_ns / NS_PER_S).tolist()
+        if self._role != "command":
+            return list(map(self._reading, times, rows.value))
+        if rows.duration is not None:
+            return list(self._targets(times, rows.value, rows.duration))
+        samples = zip(times, map(self._completed, rows.value), strict=True)
+        return [sent for sample in samples if (sent := self._samples.add(*sample)) is not None]
 
     def _reading(self, time: float, value: FloatArray) -> Reading:
-        if self._role == "tool":
-            return Reading(time, value)
-        if self._role == "goal":
-            return goal_reading(time, value)
-        if self._sees_tool:
-            return Reading(time, np.full(3, np.nan), value)
-        return motor_reading(time, value, self._twin)
+        if self._role == "position" and not self._sees_tool:
+            return motor_reading(time, value, self._twin)
+        return Reading(time, **{self._role: value})
 
-    def _commands(self, rows: Rows) -> list[Event]:
-        targets = self._checked(rows.value, LARGEST)
-        times = (rows.stamp_ns / NS_PER_S).tolist()
-        if rows.duration is None:
-            samples = zip(times, targets, strict=True)
-            sampled = [self._samples.add(time, self._completed(row)) for time, row in samples]
-            return [command for command in sampled if command is not None]
-        durations = self._checked(rows.duration, LONGEST_S)
-        events: list[Event] = []
-        for row, stamp in enumerate(times):
-            target, longest = self._completed(targets[row]), float(np.nanmax(durations[row]))
+    def _targets(
+        self, times: list[float], targets: FloatArray, durations: FloatArray
+    ) -> Iterator[CommandSent]:
+        self._check(durations, LONGEST_S)
+        for row, target in enumerate(targets):
+            duration, longest = durations[row], float(np.nanmax(durations[row]))
             if row == 0 and len(times) > 1 and not longest > 0.0 and self._target is not None:
                 continue  # the first point of a trajectory may only repeat the present pose
-            self._target = target
-            duration = np.where(durations[row] >= 0, durations[row], longest)
-            events.append(CommandSent(stamp, target, duration))
-        return events
+            self._target = self._completed(target)
+            duration = np.where(duration >= 0, duration, longest)
+            yield CommandSent(times[row], self._target, duration)
 
     def _completed(self, target: FloatArray) -> FloatArray:
         """Return a target in which motors that are not named keep their last target."""
@@ -156,13 +137,12 @@ class RosReader:
             raise InputError(f"{self._where}: the first command does not name every motor.")
         return target
 
-    def _checked(self, values: FloatArray, largest: float) -> FloatArray:
+    def _check(self, values: FloatArray, largest: float) -> None:
         if np.any(np.abs(values) > largest):
             raise InputError(
                 f"{self._where}: a message holds {np.nanmax(np.abs(values)):g}, expected values up "
                 f"to {largest:g}."
             )
-        return values
 
 
 # Writing.
@@ -175,9 +155,8 @@ PERIOD_S = 1.0
 class RosWriter:
     """Writes readings and commands as the robot itself would.
 
-    Args:
-        robot: The robot.
-        topics: Its topics.
+    Attributes:
+        origin: Angles from which the next command starts, (motor,) [rad].
 
     Raises:
         InputError: If commands are a stream of set-points, which cannot carry single commands, or
@@ -193,11 +172,7 @@ class RosWriter:
         topics.check_fits(robot)
         self._robot = robot
         self._topics = topics
-        self._origin = np.zeros(len(robot.motors))
-
-    def start_at(self, angle: FloatArray) -> None:
-        """Set the angles from which the next command starts, (motor,) [rad]."""
-        self._origin = angle
+        self.origin = np.zeros(len(robot.motors))
 
     @property
     def topics(self) -> list[tuple[str, str]]:
@@ -207,82 +182,60 @@ class RosWriter:
     def messages(self, item: Item) -> list[Outgoing]:
         """Return the messages of a reading or command; none for an answer."""
         if isinstance(item, Reading):
-            return self._of_reading(item)
+            return list(self._of_reading(item))
         return [self.command(item)] if isinstance(item, CommandSent) else []
 
     def command(self, command: CommandSent) -> Outgoing:
         """Return the message of a command."""
-        type_ = self._topics.command_type
+        topic, type_ = self._topics.command, self._topics.command_type
         if kind_of_type(type_) is Kind.TRAJECTORY:
-            content = self._trajectory(command)
+            message = Outgoing(topic, type_, self._trajectory(command))
         else:
-            content = self._joints(command.time, command.target, type_)
+            message = self._joints(topic, type_, command.time, command.target)
             # The authors' message has no field for durations; they write them as temperatures.
-            content["temperature"] = (command.duration * MS_PER_S).tolist()
-        self._origin = command.target
-        return Outgoing(self._topics.command, type_, content)
+            message.content["temperature"] = (command.duration * MS_PER_S).tolist()
+        self.origin = command.target
+        return message
 
-    def _of_reading(self, reading: Reading) -> list[Outgoing]:
-        topics, time, messages = self._topics, reading.time, []
-        for topic, type_, angle in (
-            (topics.position, topics.position_type, reading.position),
-            (topics.goal, topics.goal_type, reading.goal),
-        ):
-            if topic and angle is not None:
-                messages.append(Outgoing(topic, type_, self._joints(time, angle, type_)))
+    def _of_reading(self, reading: Reading) -> Iterator[Outgoing]:
+        topics, time = self._topics, reading.time
+        if topics.position and reading.position is not None:
+            yield self._joints(topics.position, topics.position_type, time, reading.position)
+        if topics.goal and reading.goal is not None:
+            yield self._joints(topics.goal, topics.goal_type, time, reading.goal)
         if topics.tool and np.isfinite(reading.tool).all():
-            messages.append(Outgoing(topics.tool, topics.tool_type, self._tool(reading)))
-        return messages
+            yield Outgoing(topics.tool, topics.tool_type, self._tool(reading))
 
-    def _joints(self, time: float, angle: FloatArray, type_: str) -> dict[str, Any]:
-        motors, header = self._robot.motors, _header(time)
+    def _joints(self, topic: str, type_: str, time: float, angle: FloatArray) -> Outgoing:
+        motors = self._robot.motors
         if kind_of_type(type_) is Kind.JOINT_STATE:
-            return {
-                "header": header,
-                "name": [motor.joint for motor in motors],
-                "position": angle.tolist(),
-                "velocity": [],
-                "effort": [],
-            }
-        return {
-            "header": header,
-            "name": [motor.log_column for motor in motors],
-            "position": self._robot.servo_units.to_counts(angle).tolist(),
-            "temperature": [],
-            "voltage": [],
-        }
+            names, values = [motor.joint for motor in motors], angle
+        else:
+            names = [motor.log_column for motor in motors]
+            values = self._robot.servo_units.to_counts(angle)
+        content = {"header": _header(time), "name": names, "position": values.tolist()}
+        return Outgoing(topic, type_, content)
 
     def _tool(self, reading: Reading) -> dict[str, Any]:
         header = {**_header(reading.time), "frame_id": self._robot.profile.base_link}
         point = dict(zip("xyz", reading.tool.tolist(), strict=True))
         if kind_of_type(self._topics.tool_type) is Kind.POINT:
             return {"header": header, "point": point}
-        unknown = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
-        return {"header": header, "pose": {"position": point, "orientation": unknown}}
+        return {"header": header, "pose": {"position": point, "orientation": {"w": 1.0}}}
 
     def _trajectory(self, command: CommandSent) -> dict[str, Any]:
         """Return a trajectory with one point per time of arrival, which makes it exact."""
-        points = []
-        for due in np.unique(command.duration):
-            share = np.divide(
-                due, command.duration, out=np.ones_like(command.target), where=command.duration > 0
-            )
-            angle = self._origin + np.minimum(share, 1.0) * (command.target - self._origin)
-            points.append(
-                {
-                    "positions": angle.tolist(),
-                    "velocities": [],
-                    "accelerations": [],
-                    "effort": [],
-                    "time_from_start": _stamp(float(due)),
-                }
-            )
+        ramp = Ramp(0.0, self.origin, command.target, command.duration)
+        points = [
+            {"positions": ramp.at(max(due, SHORTEST_S)).tolist(), "time_from_start": _stamp(due)}
+            for due in np.unique(command.duration).tolist()
+        ]
         names = [motor.joint for motor in self._robot.motors]
         return {"header": _header(command.time), "joint_names": names, "points": points}
 
 
 def _header(time: float) -> dict[str, Any]:
-    return {"seq": 0, "stamp": _stamp(time), "frame_id": ""}
+    return {"stamp": _stamp(time)}
 
 
 def _stamp(time: float) -> dict[str, int]:
@@ -292,10 +245,6 @@ def _stamp(time: float) -> dict[str, int]:
 
 class DiagnosticsWriter:
     """Writes answers as diagnostics: every second, and at once when a status gets worse.
-
-    Args:
-        robot: The robot.
-        topics: Its topics.
 
     Attributes:
         topics: Name and type of the topic that is written to.

@@ -10,6 +10,7 @@ from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.readers.bag_messages import (
     MONITORING,
+    ROLES,
     Kind,
     Role,
     check_role,
@@ -104,13 +105,8 @@ class RosTopics:
     @property
     def subscribed(self) -> list[tuple[Role, str, str]]:
         """Role, name and type of every topic of the robot."""
-        topics: list[tuple[Role, str, str]] = [
-            ("command", self.command, self.command_type),
-            ("tool", self.tool, self.tool_type),
-            ("position", self.position, self.position_type),
-            ("goal", self.goal, self.goal_type),
-        ]
-        return [entry for entry in topics if entry[1]]
+        named = [role for role in ROLES if getattr(self, role)]
+        return [(role, getattr(self, role), getattr(self, f"{role}_type")) for role in named]
 
 
 def load_topics(path: Path | None) -> RosTopics:
@@ -119,10 +115,4 @@ def load_topics(path: Path | None) -> RosTopics:
     Raises:
         InputError: If the file cannot be read, or has an unknown key or an invalid value.
     """
-    if path is None:
-        return RosTopics()
-    try:
-        return from_table(RosTopics, read_toml(path), str(path))
-    except InputError as error:
-        where = "" if str(error).startswith(str(path)) else f"{path}: "
-        raise InputError(f"{where}{error}") from error
+    return RosTopics() if path is None else from_table(RosTopics, read_toml(path), str(path))

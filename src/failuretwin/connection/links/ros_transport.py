@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -31,7 +32,8 @@ class Outgoing:
     Attributes:
         topic: Its topic.
         type: Its type, by its ROS 1 name.
-        content: Its fields; stamps and durations are tables of `secs` and `nsecs`.
+        content: Its fields, without those that are empty or zero; stamps and durations are tables
+            of `secs` and `nsecs`.
     """
 
     topic: str
@@ -80,48 +82,55 @@ class RosCodec:
         serialize = self._store.serialize_ros1 if self._ros == 1 else self._store.serialize_cdr
         return bytes(serialize(_message(self._store, name, message.content), name))
 
-    def decode(self, type_: str, data: bytes) -> tuple[Any, Kind]:
-        """Return a message of ROS 2 as an object with the fields of its kind, and its kind.
+    def decode(self, data: bytes, type_: str, definition: str = "") -> tuple[Any, Kind]:
+        """Return a message as an object with the fields of its kind, and its kind.
+
+        Args:
+            data: The message.
+            type_: Its type.
+            definition: Definition of the type by its publisher, with all types in it; empty: as
+                known here.
 
         Raises:
             InputError: If the type is of no known kind.
             Exception: Any error of rosbags if the bytes do not fit the type.
         """
         name = self.full_name(type_)
-        return self._store.deserialize_cdr(data, name), kind_in(self._store, name)
+        store = _defined(name, definition) if definition else self._store
+        kind = kind_of(message_fields(store, name))
+        if kind is None:
+            raise InputError(f"a message of type {name} is of no kind that is understood.")
+        decode = store.deserialize_ros1 if self._ros == 1 else store.deserialize_cdr
+        return decode(data, name), kind
 
 
-def kind_in(store: Typestore, type_: str) -> Kind:
-    """Return the kind of a message type.
+@cache
+def _defined(type_: str, definition: str) -> Typestore:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    Raises:
-        InputError: If it is of no known kind.
-    """
-    kind = kind_of(message_fields(store, type_))
-    if kind is None:
-        raise InputError(f"a message of type {type_} is of no kind that is understood.")
-    return kind
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(definition, type_))
+    return store
 
 
 def _message(store: Typestore, type_: str, content: dict[str, Any]) -> Any:
     """Return a message object of rosbags from plain values."""
     _, fields = store.fielddefs[type_]
-    values = {
-        name: _value(store, kind, content[_TIME_PARTS.get(name, name)]) for name, kind in fields
-    }
-    return store.types[type_](**values)
+    given = {name: content.get(_TIME_PARTS.get(name, name)) for name, _ in fields}
+    return store.types[type_](**{name: _value(store, kind, given[name]) for name, kind in fields})
 
 
 def _value(store: Typestore, description: Any, value: Any) -> Any:
+    """Return a field's value; a value of None is empty or zero."""
     kind, detail = description
     if kind.name == "NAME":
-        return _message(store, detail, value)
+        return _message(store, detail, value or {})
     if kind.name == "BASE":
-        return value
+        return ("" if detail[0] == "string" else 0) if value is None else value
     (item_kind, item), _ = detail
     if item_kind.name == "NAME":
-        return [_message(store, item, part) for part in value]
-    return list(value) if item[0] == "string" else np.array(value, dtype=item[0])
+        return [_message(store, item, part) for part in value or ()]
+    return list(value or ()) if item[0] == "string" else np.array(value or (), dtype=item[0])
 
 
 # Transports.
@@ -130,6 +139,8 @@ Decode = Callable[[], tuple[Any, Kind]]
 """Returns a message as an object with the fields of its kind, and its kind."""
 Take = Callable[[Decode], None]
 """Handles a message; may be called from any thread."""
+LISTENER_S = 5.0
+"""Longest wait for a listener to commands [s]."""
 
 
 class Transport(ABC):
@@ -137,21 +148,54 @@ class Transport(ABC):
 
     Attributes:
         name: Name for messages to the user.
-        refusals: Complaints of the far side about our calls.
+        far_side: What it is connected to, for messages to the user.
     """
 
     name: str
-    refusals: Sequence[str] = ()
+    far_side: str
+    _reconnects, _was_gone = 0, False
 
     @property
-    @abstractmethod
     def trouble(self) -> str:
         """Reason why messages do not arrive at present; empty if they do."""
+        return f"the {self.far_side} is gone" if self._look() else ""
 
     @property
-    @abstractmethod
     def reconnects(self) -> int:
-        """Number of times that the far side went away and came back."""
+        """Number of times that the far side was seen to go away and come back."""
+        self._look()
+        return self._reconnects
+
+    def _look(self) -> bool:
+        gone = self.is_gone()
+        self._reconnects += self._was_gone and not gone
+        self._was_gone = gone
+        return gone
+
+    def check_listener(self, topic: str) -> None:
+        """Wait until somebody listens to an advertised topic.
+
+        Raises:
+            InputError: If the far side is gone, or nobody listens within `LISTENER_S`.
+        """
+        until = time.monotonic() + LISTENER_S
+        while not self.is_heard(topic):
+            if self.trouble:
+                raise InputError(f"{self.trouble}; nothing was sent.")
+            if time.monotonic() > until:
+                raise InputError(
+                    f"nobody listens to topic {topic}: the order would reach no robot. Start its "
+                    "driver, or name the topic of commands in a file for --topics."
+                )
+            time.sleep(0.05)
+
+    @abstractmethod
+    def is_gone(self) -> bool:
+        """Return whether the far side is gone."""
+
+    @abstractmethod
+    def is_heard(self, topic: str) -> bool:
+        """Return whether another program listens to an advertised topic, as far as is known."""
 
     @abstractmethod
     def subscribe(self, topic: str, type_: str, take: Take) -> None:
@@ -166,10 +210,6 @@ class Transport(ABC):
         """Publish a message on an advertised topic; lost if the far side is gone."""
 
     @abstractmethod
-    def check_listener(self, topic: str) -> None:
-        """Raise InputError if nothing that is published on a topic would reach a robot."""
-
-    @abstractmethod
     def close(self) -> None:
         """End all subscriptions and publishers, and the connection."""
 
@@ -178,23 +218,3 @@ class Transport(ABC):
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-LISTENER_S = 5.0
-"""Longest wait for a listener to commands [s]."""
-
-
-def wait_for_listener(topic: str, listening: Callable[[], bool]) -> None:
-    """Wait until there is a listener to a topic.
-
-    Raises:
-        InputError: If there is none within `LISTENER_S`.
-    """
-    until = time.monotonic() + LISTENER_S
-    while not listening():
-        if time.monotonic() > until:
-            raise InputError(
-                f"nobody listens to topic {topic}: the order would reach no robot. Start its "
-                "driver, or name the topic of commands in a file for --topics."
-            )
-        time.sleep(0.05)

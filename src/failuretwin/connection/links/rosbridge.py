@@ -9,7 +9,7 @@ from typing import Any
 
 from failuretwin.connection.links.ros_transport import Outgoing, Take, Transport
 from failuretwin.core.errors import InputError, needs_extra
-from failuretwin.data_knowledge.readers.bag_messages import kind_of_type
+from failuretwin.data_knowledge.readers.bag_messages import Kind, kind_of_type
 
 BRIDGE_PORT = 9090
 """Default port of rosbridge servers."""
@@ -21,7 +21,6 @@ GOODBYE_S = 2.0
 """Longest wait for the server at the end [s]."""
 COMPLAINTS = ("error", "warning")
 """Levels of the server's status messages that count as refusals."""
-GONE = "the rosbridge server is gone"
 _ROS1_TIME = {"secs": "sec", "nsecs": "nanosec"}
 """Fields of a time in ROS 1, and in ROS 2."""
 
@@ -37,13 +36,13 @@ class RosbridgeTransport(Transport):
         InputError: If roslibpy is missing or no server answers.
     """
 
+    far_side = "rosbridge server"
+
     def __init__(self, host: str, port: int = BRIDGE_PORT) -> None:
         with needs_extra("rosbridge needs roslibpy", "live"):
             import roslibpy
-        self._connections = 0
-        self.refusals: list[str] = []
         self._topics: dict[str, Any] = {}
-        self._subscribed: list[Any] = []
+        self._takes: list[Take] = []
         self._ros = ros = roslibpy.Ros(host, port, transport="asyncio")
         self._topic = partial(roslibpy.Topic, ros)
         ros.factory.set_max_delay(RECONNECT_S)
@@ -58,21 +57,20 @@ class RosbridgeTransport(Transport):
             ) from error
         self.name = f"rosbridge {ros.factory.url}"
 
-    @property
-    def trouble(self) -> str:
-        """Whether the server is gone."""
-        return "" if self._ros.is_connected else GONE
+    def is_gone(self) -> bool:
+        """Return whether the server is gone."""
+        return not self._ros.is_connected
 
-    @property
-    def reconnects(self) -> int:
-        """Number of times that the server went away and came back."""
-        return max(0, self._connections - 1)
+    def is_heard(self, topic: str) -> bool:
+        """Return whether the server is there; it does not tell who listens."""
+        return not self.is_gone()
 
     def subscribe(self, topic: str, type_: str, take: Take) -> None:
         """Call `take` with every message of a topic, which must be of the type."""
-        kind, subscribed = kind_of_type(type_), self._topic(topic, type_)
-        subscribed.subscribe(lambda message: take(lambda: (_as_object(message), kind)))
-        self._subscribed.append(subscribed)
+        kind = kind_of_type(type_)
+        heard = self._topic(topic, type_)
+        heard.subscribe(lambda message: take(lambda: (_as_object(message), kind)))
+        self._takes.append(take)
 
     def advertise(self, topic: str, type_: str) -> None:
         """Prepare a topic for publishing."""
@@ -84,18 +82,9 @@ class RosbridgeTransport(Transport):
         if self._ros.is_connected:
             self._topics[message.topic].publish(message.content)
 
-    def check_listener(self, topic: str) -> None:
-        """Raise InputError if the server is gone; it does not tell who listens."""
-        if self.trouble:
-            raise InputError(f"{GONE}; nothing was sent.")
-
     def close(self) -> None:
-        """Close the connection, and wait for the server to confirm."""
+        """Close the connection, and with it all topics; wait for the server to confirm."""
         if self._ros.is_connected:
-            for subscribed in self._subscribed:
-                subscribed.unsubscribe()
-            for topic in self._topics.values():
-                topic.unadvertise()
             closed = threading.Event()
             self._ros.factory.once("close", lambda _: closed.set())
             self._ros.close()
@@ -103,17 +92,19 @@ class RosbridgeTransport(Transport):
         self._ros.terminate()
 
     def _connected(self, protocol: Any) -> None:
-        """Count a connection, and listen to the server's status messages.
-
-        roslibpy registers no handler for them and has no interface to add one.
-        """
-        self._connections += 1
+        """Listen to the server's status messages; roslibpy has no interface for that."""
         protocol._message_handlers["status"] = self._take_status
 
     def _take_status(self, status: Any) -> None:
-        """Keep a complaint, such as a refused topic, which stays silent from then on."""
-        if status.get("level") in COMPLAINTS:
-            self.refusals.append(f"rosbridge says: {status.get('msg', '')}")
+        """Hand on a complaint, such as a refused topic, which stays silent from then on."""
+        if status.get("level") not in COMPLAINTS:
+            return
+
+        def refuse() -> tuple[Any, Kind]:
+            raise InputError(f"rosbridge says: {status.get('msg', '')}")
+
+        for take in self._takes[:1]:
+            take(refuse)
 
 
 def _as_object(value: Any) -> Any:

@@ -69,12 +69,9 @@ def _arm(diagnosis: Diagnosis, alarm: Alarm) -> Status:
     values |= {"diagnosis": best, "probability": _number(diagnosis.posterior[best])}
     if best != "healthy":
         values |= _size(diagnosis)
-    if diagnosis.runner_up is not None:
-        runner_up = diagnosis.runner_up
-        values |= {
-            "runner_up": runner_up,
-            "runner_up_probability": _number(diagnosis.posterior[runner_up]),
-        }
+    if (runner_up := diagnosis.runner_up) is not None:
+        values["runner_up"] = runner_up
+        values["runner_up_probability"] = _number(diagnosis.posterior[runner_up])
     message = diagnosis.verdict
     if alarm.cause and alarm.cause != best:
         share = diagnosis.posterior.get(alarm.cause, 0.0)
@@ -109,14 +106,11 @@ def _motor(diagnosis: Diagnosis, alarm: Alarm, motor: str) -> Status:
     }
     total = min(1.0, sum(modes.values()))
     ranked = sorted(modes, key=lambda mode: -modes[mode])
-    values = {"probability": _number(total)}
-    if ranked:
-        values["mode"] = ranked[0]
-        best = diagnosis.ranked[0]
-        if f"{motor}:{ranked[0]}" in best.split("+"):
-            values |= _size(diagnosis)
-    if len(ranked) > 1:
-        values["runner_up"] = ranked[1]
+    values = {"probability": _number(total)} | dict(
+        zip(("mode", "runner_up"), ranked, strict=False)
+    )
+    if ranked and f"{motor}:{ranked[0]}" in diagnosis.ranked[0].split("+"):
+        values |= _size(diagnosis)
     level = _level(alarm, motor)
     if level == LEVEL_OK or not ranked:
         return Status(motor, level, f"no fault seen ({100 * total:.1f} % faulty)", values)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import heapq
-from bisect import insort
+from bisect import bisect_right, insort
 from dataclasses import dataclass
-from itertools import count
 from time import time as wall_clock
 
 import numpy as np
 
-from failuretwin.connection.links.base import CommandSent, Event
+from failuretwin.connection.links.base import CommandSent, Event, Reading
 from failuretwin.core.types import FloatArray
 
 LEAP_S = 60.0
@@ -110,6 +108,11 @@ HELD_BACK = 10_000
 """Maximum number of events held back; beyond it the oldest are released at once."""
 
 
+def order(event: Event) -> tuple[float, bool]:
+    """Return the place of an event: by its time, a command before a reading of the same time."""
+    return event.time, isinstance(event, Reading)
+
+
 class ReorderBuffer:
     """Buffer that puts late events into the order of their times.
 
@@ -119,19 +122,17 @@ class ReorderBuffer:
 
     def __init__(self, hold_s: float = 0.0) -> None:
         self._hold_s = hold_s
-        self._waiting: list[tuple[float, bool, int, Event]] = []
-        self._number = count()
+        self._waiting: list[Event] = []
 
     def add(self, event: Event) -> None:
-        """Add an event; a command goes before a reading of the same time."""
-        entry = (event.time, not isinstance(event, CommandSent), next(self._number), event)
-        heapq.heappush(self._waiting, entry)
+        """Add an event."""
+        insort(self._waiting, event, key=order)
 
     def ready(self, now: float) -> list[Event]:
         """Return the events that are released at a stream time [s]."""
-        events, until = [], now - self._hold_s
-        while self._waiting and (self._waiting[0][0] <= until or len(self._waiting) > HELD_BACK):
-            events.append(heapq.heappop(self._waiting)[-1])
+        due = bisect_right(self._waiting, now - self._hold_s, key=lambda event: event.time)
+        due = max(due, len(self._waiting) - HELD_BACK)
+        events, self._waiting = self._waiting[:due], self._waiting[due:]
         return events
 
 
@@ -197,33 +198,28 @@ class LiveReference:
         """
         corners: list[Corner] = []
         while self._pending and self._pending[0].time <= time:
-            self._begin(self._pending.pop(0), corners)
-        self._add_ends(time, corners)
-        if self._ramp is not None and time > self._known_until:
-            corners.append((time, self._ramp.at(time)))
+            corners += self._begin(self._pending.pop(0))
+        corners += self._draw_to(time)
         self._known_until = max(self._known_until, time)
         return corners
 
-    def _begin(self, command: CommandSent, corners: list[Corner]) -> None:
+    def _begin(self, command: CommandSent) -> list[Corner]:
+        """Begin a command and return the corners up to then."""
         # Corners that were returned cannot be changed: a command that comes late starts late.
         start = max(command.time, self._known_until)
-        self._add_ends(start, corners)
-        if self._ramp is None:
-            origin = command.target
-        else:
-            origin = self._ramp.at(start)
-            if start > self._known_until:
-                corners.append((start, origin))
-                self._known_until = start
         late = start - command.time
         self.late_s = max(self.late_s, late)
+        corners = self._draw_to(start)
+        origin = command.target if self._ramp is None else self._ramp.at(start)
         self._ramp = Ramp(start, origin, command.target, np.maximum(command.duration - late, 0.0))
+        return corners
 
-    def _add_ends(self, time: float, corners: list[Corner]) -> None:
-        """Add the ends of the motors' ramps before a time [s]."""
-        if self._ramp is None:
-            return
-        for end in np.unique(self._ramp.start + self._ramp.duration).tolist():
-            if self._known_until < end < time:
-                corners.append((end, self._ramp.at(end)))
-                self._known_until = end
+    def _draw_to(self, time: float) -> list[Corner]:
+        """Return the ends of the motors' ramps up to a time [s], and the reference then."""
+        ramp, known = self._ramp, self._known_until
+        if ramp is None or time <= known:
+            return []
+        self._known_until = time
+        ends = np.unique(ramp.start + ramp.duration)
+        times = [*ends[(known < ends) & (ends < time)].tolist(), time]
+        return [(at, ramp.at(at)) for at in times]

@@ -11,10 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from failuretwin.connection.tracked_diagnosis import begin, with_timing_of
+from failuretwin.connection.population import stated_variation
+from failuretwin.connection.self_calibration import with_timing_of
+from failuretwin.connection.tracked_diagnosis import begin
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
-from failuretwin.digital_model.nonidealities import Imperfections, Variation
+from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -98,15 +100,9 @@ class LifeLearner:
     def _model(self) -> HealthyModel:
         """Return the robot as it is believed to be by now, with what is left of the doubt."""
         life, learned = self._life, self._life.learned
-        _, (bias, compliance, friction) = life.offsets
-        size = np.abs(np.asarray(learned.settling.compliance if learned.settling else 0.0))
-        relative = np.divide(compliance, size, out=np.zeros_like(compliance), where=size > 1e-9)
-        doubt = replace(
-            learned.variation or Variation(),
-            bias=tuple(bias.tolist()),
-            compliance=tuple(np.minimum(relative, 1.0).tolist()),
-            friction=tuple(friction.tolist()),
-        )
+        _, deviation = life.offsets
+        settling = replace(life.model, imperfections=learned).settling
+        doubt = stated_variation(deviation, settling, learned.variation)
         return replace(life.model, imperfections=replace(learned, variation=doubt))
 
 
