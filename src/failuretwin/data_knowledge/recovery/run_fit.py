@@ -44,6 +44,8 @@ EARLIEST_S = 0.1
 
 GUESSES = (6, 24, 96, 384)
 """Numbers of first guesses of a ramp, tried until a fit is as good as the path."""
+MOST_MOTORS = 4
+"""Motors whose pose follows from a tool position and the count of the last one."""
 WHOLE_STARTS = 16
 """First guesses of a pose for every count of the last motor."""
 OUTSIDE_FACTOR = 10.0
@@ -263,7 +265,7 @@ class _Run:
         """
         for count in GUESSES:
             yield self._fitted(m, origins, None, count)
-        if not self._is_cut_off(m):
+        if not self._is_cut_off(m) and len(self._zero) <= MOST_MOTORS:
             yield self._fitted(m, origins, self._whole_poses(self.rests[m + 1]), GUESSES[-1])
 
     def _rounded(self, ramp: Movements, part: PathPart, free_origin: bool) -> Movements:
