@@ -11,7 +11,6 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
-from failuretwin.data_knowledge.recovery.plane_arm import plane_arm
 from failuretwin.data_knowledge.recovery.ramp_fit import PathPart, fit
 from failuretwin.data_knowledge.recovery.recovery import (
     path_error,
@@ -270,25 +269,6 @@ def test_the_search_follows_the_chain(armpi, simulated, change):
     assert path_error(found, desired, FROM_ZERO, robot).max() <= 1e-12
 
 
-def test_whole_poses_are_all_and_only_those_that_reach(armpi, twin):
-    arm, rng = plane_arm(armpi), np.random.default_rng(4)
-    low, high = arm.movement_counts.low, arm.movement_counts.high
-    np.testing.assert_array_equal(low, [167, 292, 292, 292])
-    np.testing.assert_array_equal(high, [833, 708, 708, 708])
-    for counts in np.round(rng.uniform(low, high, (20, 4))):
-        point = twin.path(armpi.servo_units.to_rad(counts))
-        np.testing.assert_array_equal(arm.whole_poses(point), counts[None])
-        assert len(arm.whole_poses(point + 1e-6)) == 0
-
-
-def test_poses_with_a_given_last_motor_reach_their_point(armpi, twin):
-    arm = plane_arm(armpi)
-    wanted = np.array([0.4, 0.3, -0.5, 0.2])
-    poses = arm.poses(twin.path(wanted), np.linspace(-0.3, 0.7, 11))
-    np.testing.assert_allclose(twin.path(poses), np.tile(twin.path(wanted), (len(poses), 1)))
-    assert np.linalg.norm(poses - wanted, axis=1).min() < 1e-9
-
-
 def test_fit_of_a_ramp_finds_all_that_is_free(twin):
     rng = np.random.default_rng(2)
     initial, target = rng.uniform(-0.8, 0.8, (2, 1, 4))
@@ -303,13 +283,20 @@ def test_fit_of_a_ramp_finds_all_that_is_free(twin):
     np.testing.assert_allclose(found.start, start, atol=1e-9)
 
 
-def test_another_kind_of_arm_asks_for_approximate(armpi, simulated):
+def test_another_kind_of_arm_comes_back_exactly_too(armpi, simulated):
     robot = skewed(armpi)
-    desired = DigitalTwin(robot).path(simulated.reference(FROM_ZERO))[:1]
-    with pytest.raises(InputError, match="three parallel axes") as caught:
-        on_known_grid(desired, robot, names=["a"])
-    assert "--approximate" in str(caught.value)
+    desired = DigitalTwin(robot).path(simulated.reference(FROM_ZERO))[:3]
+    found = on_known_grid(desired, robot, names=names_of(desired))
+    assert path_error(found, desired, FROM_ZERO, robot).max() <= 1e-9
+    whole = settles(simulated.start[:3], simulated.ramp_duration[:3], FROM_ZERO[-1])
+    np.testing.assert_allclose(found.target[whole], simulated.target[:3][whole], atol=1e-9)
 
+
+def test_a_robot_without_servo_units_asks_for_approximate(armpi, simulated):
+    robot = replace(armpi, profile=replace(armpi.profile, servo_units=None))
+    desired = DigitalTwin(robot).path(simulated.reference(FROM_ZERO))[:1]
+    with pytest.raises(InputError, match=r"the robot has no servo units.*--approximate"):
+        on_known_grid(desired, robot, names=["a"])
     grid, found = recover_movements(desired, robot, approximate=True, names=["a"])
     np.testing.assert_array_equal(grid, published_time_bases(1000)[0])
     assert path_error(found, desired, grid, robot).max() < 5e-3

@@ -19,7 +19,12 @@ from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge import resumable
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.resumable import make_chunk, produce
+from failuretwin.data_knowledge.resumable import (
+    UnfinishedRunSet,
+    make_chunk,
+    produce,
+    versions,
+)
 from failuretwin.data_knowledge.store import load_run_set, save_run_set, sole_writer
 from failuretwin.data_knowledge.workers import ONE_PROCESS
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -289,15 +294,22 @@ def test_a_lock_is_for_one_run_set_and_ends_with_its_block(tmp_path):
         assert listing(tmp_path) == [".a.zarr.lock"]
 
 
+def started(plan, folder):
+    """Return a job as workers get it."""
+    job = UnfinishedRunSet(plan, folder / ".runs.zarr.partial", PIECE, versions())
+    job.begin()
+    return job
+
+
 def test_worker_with_other_versions_is_refused(tmp_path, imperfect):
-    job, _ = resumable._open(imperfect, tmp_path / "runs.zarr", PIECE)
+    job = started(imperfect, tmp_path)
     other = replace(job, versions={**job.versions, "numpy": "1.0"})
     with pytest.raises(InputError, match=r"expected .*numpy 1\.0.* Install the same versions"):
         make_chunk(other, 0)
 
 
 def test_worker_that_does_not_share_the_folder_is_refused(tmp_path, imperfect):
-    job, _ = resumable._open(imperfect, tmp_path / "runs.zarr", PIECE)
+    job = started(imperfect, tmp_path)
     job.remove()
     with pytest.raises(InputError, match=r"sees no .* that all workers share"):
         make_chunk(job, 0)

@@ -20,7 +20,7 @@ import numpy as np
 
 from failuretwin import __version__
 from failuretwin.core.config import canonical, fingerprint
-from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.errors import InputError, check_name
 from failuretwin.core.hypothesis import (
     Fault,
     Hypothesis,
@@ -137,17 +137,14 @@ class Plan:
     def _check(self) -> None:
         if self.runs_per_class < 1:
             raise InputError(f"runs per class is {self.runs_per_class}, expected 1 or more.")
-        if self.engine not in ENGINES:
-            raise unknown_name("engine", self.engine, ENGINES)
+        check_name("engine", self.engine, ENGINES)
         for kind in self.sensors:
-            if kind not in SIMULATED:
-                raise unknown_name("sensor", kind, SIMULATED)
+            check_name("sensor", kind, SIMULATED)
         for hypothesis in self.hypotheses:
             if not hypothesis.known:
                 raise InputError("'unknown' cannot be simulated. Name the faults to simulate.")
             for fault in hypothesis.faults:
-                if fault.mode not in self.modes:
-                    raise unknown_name("fault mode", fault.mode, self.modes)
+                check_name("fault mode", fault.mode, self.modes)
                 if self.modes[fault.mode].needs_compliance and self.engine == "servo":
                     self._check_compliance(fault)
 
@@ -167,6 +164,11 @@ class Plan:
     def size(self) -> int:
         """Number of runs."""
         return len(self.hypotheses) * self.runs_per_class
+
+    def chunks(self, size: int) -> list[range]:
+        """Return the numbers of all runs, `size` of them at a time."""
+        runs = range(self.size)
+        return [runs[first : first + size] for first in runs[::size]]
 
     @property
     def time(self) -> FloatArray:
@@ -364,12 +366,10 @@ def simulate(
     Raises:
         InputError: If workers are fewer than one or cannot be had.
     """
-    starts = range(0, plan.size, CHUNK_RUNS)
-    chunks = [range(first, min(first + CHUNK_RUNS, plan.size)) for first in starts]
-    parts: dict[range, xr.Dataset] = {}
-    workforce = Workforce(workers, scheduler)
-    with workforce.map_unordered(partial(simulate_runs, plan), chunks) as results:
-        for chunk, table in results:
-            parts[chunk] = table.to_dataset()
+    chunks = plan.chunks(CHUNK_RUNS)
+    parts = []
+    with Workforce(workers, scheduler).map(partial(simulate_runs, plan), chunks) as tables:
+        for chunk, table in zip(chunks, tables, strict=True):
+            parts.append(table.to_dataset())
             on_progress(len(chunk))
-    return concatenate([parts[chunk] for chunk in chunks])
+    return concatenate(parts)

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import closing, contextmanager
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
-from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from failuretwin.core.errors import FailureTwinError, InputError, needs_extra
 from failuretwin.failure_behavior.registry import plugin_files
@@ -20,111 +19,33 @@ from failuretwin.failure_behavior.registry import plugin_files
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-# Clients of Dask: of a scheduler that runs somewhere, or of processes of our own.
-
-ANSWER_S = 5.0
-"""Time that a scheduler has to answer [s]."""
-FIRST_WORKER_S = 30.0
-"""Time that a first worker has to come, also after all have gone [s]."""
-NEVER = logging.CRITICAL + 1
-IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
-"""First code of our own workers: an interrupt is for the parent, which then ends them."""
-
-
-@contextmanager
-def dask_client(workers: int, scheduler: str | None) -> Iterator[Client]:
-    """Give a client of a scheduler, whose workers know all modes; leaving the block closes it.
-
-    Args:
-        workers: Processes of our own on this machine, if there is no scheduler.
-        scheduler: Address of a running one.
-
-    Raises:
-        InputError: If Dask is not installed, or the scheduler does not answer or has no workers.
-    """
-    with needs_extra("several workers need Dask", "cluster"):
-        import distributed  # noqa: F401
-    cluster = _own_cluster(workers) if scheduler is None else _connected(scheduler)
-    with _silence(), cluster as client:
-        for path in plugin_files():
-            client.upload_file(str(path))
-        yield client
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Keep Dask's log to ourselves: what matters comes back as an error."""
-    handlers = logging.getLogger("distributed").handlers
-    before = [handler.level for handler in handlers]
-    for handler in handlers:
-        handler.setLevel(NEVER)
-    try:
-        yield
-    finally:
-        for handler, level in zip(handlers, before, strict=True):
-            handler.setLevel(level)
-
-
-@contextmanager
-def _own_cluster(workers: int) -> Iterator[Client]:
-    from distributed import Client, LocalCluster
-
-    cluster = LocalCluster(
-        n_workers=workers,
-        threads_per_worker=1,
-        processes=True,
-        memory_limit=0,  # no limit: memory is bounded by the size of a chunk
-        host="127.0.0.1",
-        dashboard_address="127.0.0.1:0",  # it insists on a port: any, seen from here alone
-        scheduler_kwargs={"dashboard": False},
-        silence_logs=NEVER,
-        preload=[IGNORE_INTERRUPTS],
-    )
-    with cluster, Client(cluster, set_as_default=False) as client:
-        yield client
-
-
-@contextmanager
-def _connected(address: str) -> Iterator[Client]:
-    from distributed import Client
-    from distributed.comm.addressing import get_address_host_port
-
-    try:
-        get_address_host_port(address)  # a client with a wrong address never closes completely
-        client = Client(address, timeout=ANSWER_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(
-            f"scheduler {address!r} does not answer ({_reason(error)}). Expected the address that "
-            "`dask scheduler` prints when it starts, such as tcp://host:8786."
-        ) from error
-    with client:
-        try:
-            client.wait_for_workers(1, timeout=FIRST_WORKER_S)
-        except TimeoutError as error:
-            raise InputError(
-                f"scheduler {address!r} has no workers. Start some: dask worker {address}"
-            ) from error
-        yield client
-
-
-def _reason(error: BaseException) -> str:
-    """Return what Dask says of an error, on one line."""
-    return " ".join(str(error).split()) or type(error).__name__
-
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-TASKS_PER_THREAD = 2
-"""Tasks submitted at a time: one to do and one that waits, which keeps every worker busy."""
-LOOK_S = 30.0
-"""Time without a result after which it is looked whether there are workers at all [s]."""
-LONGEST_WAIT_S = 1800.0
-"""Longest wait for the next result [s]: many times what a piece takes on a slow machine."""
-
-
 WORKERS_PER_CORE = 4
-"""Most processes of our own for each processor."""
+"""Maximum number of processes of our own per processor."""
+ANSWER_S = 5.0
+"""Time limit for the answer of a scheduler [s]."""
+FIRST_WORKER_S = 30.0
+"""Time limit for the first worker, also after all have gone [s]."""
+LOOK_S = 30.0
+"""Wait for a result after which the workers are counted [s]."""
+LONGEST_WAIT_S = 1800.0
+"""Maximum wait for the next result [s]: many times the duration of a task on a slow machine."""
+NEVER = logging.CRITICAL + 1
+OWN_WORKERS: dict[str, Any] = {
+    "threads_per_worker": 1,
+    "processes": True,
+    "memory_limit": 0,  # no limit: memory is bounded by the size of a chunk
+    "host": "127.0.0.1",
+    "dashboard_address": "127.0.0.1:0",  # it insists on a port: any, visible on this machine only
+    "scheduler_kwargs": {"dashboard": False},
+    "silence_logs": NEVER,
+    # The parent process handles an interrupt and ends the workers.
+    "preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
+    "set_as_default": False,
+}
+"""Options of Dask for workers of our own."""
 
 
 @dataclass(frozen=True)
@@ -154,96 +75,100 @@ class Workforce:
             )
 
     @contextmanager
-    def map_unordered(
+    def map(
         self, work: Callable[[Item], Result], items: Iterable[Item]
-    ) -> Iterator[Iterator[tuple[Item, Result]]]:
-        """Give every item with its result, in the order in which they are done.
+    ) -> Iterator[Iterator[Result]]:
+        """Give the results in the order of the items; leaving the block ends the work.
 
-        A worker that dies is replaced and its items are given to others. Leaving the block ends
-        the work.
+        A worker that dies is replaced and its items are given to others.
 
         Args:
             work: A function that other processes can import.
-            items: Its arguments, one a call.
+            items: Its arguments, one per call.
 
         Raises:
             InputError: If Dask is not installed, or the scheduler or its workers do not answer
                 or cannot run the work.
-            FailureTwinError: If workers keep dying, are gone for `FIRST_WORKER_S`, or finish
-                nothing for `LONGEST_WAIT_S`.
+            FailureTwinError: If workers keep dying, are gone for `FIRST_WORKER_S`, or do not
+                finish the next item within `LONGEST_WAIT_S`.
         """
         if self.workers == 1 and self.scheduler is None:
-            yield ((item, work(item)) for item in items)
+            yield map(work, items)
             return
-        with (
-            dask_client(self.workers, self.scheduler) as client,
-            closing(_spread(client, work, items)) as results,
-        ):
-            yield results
+        with needs_extra("several workers need Dask", "cluster"):
+            import distributed  # noqa: F401
+        with _silence(), _dask_client(self) as client:
+            for path in plugin_files():
+                client.upload_file(str(path))
+            yield _results(client, deque(client.map(work, list(items), pure=False)))
 
 
 ONE_PROCESS = Workforce()
 
 
-def _spread(
-    client: Client, work: Callable[[Item], Result], items: Iterable[Item]
-) -> Generator[tuple[Item, Result]]:
-    """Give items with their results; only as many are submitted as workers can do soon."""
-    waiting = iter(items)
-    submitted: dict[Future[Result], Item] = {}
-    done: SimpleQueue[Future[Result]] = SimpleQueue()
-
-    def submit() -> None:
-        threads = max(1, sum(client.nthreads().values()))
-        for item in islice(waiting, max(0, TASKS_PER_THREAD * threads - len(submitted))):
-            future = client.submit(work, item, pure=False)
-            submitted[future] = item
-            future.add_done_callback(done.put)
-
-    submit()
-    while submitted:
-        future = _next_done(client, done)
-        yield submitted.pop(future), _result(future)
-        submit()
-
-
-def _next_done(client: Client, done: SimpleQueue[Future[Result]]) -> Future[Result]:
-    """Wait for the next future that is done, but not for ever."""
-    for _ in range(round(LONGEST_WAIT_S / LOOK_S)):
-        try:
-            return done.get(timeout=LOOK_S)
-        except Empty:
-            _check_workers(client)
-    raise _nothing_done()
-
-
-def _check_workers(client: Client) -> None:
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep Dask from logging: errors report what matters."""
+    handlers = logging.getLogger("distributed").handlers
+    before = [handler.level for handler in handlers]
+    for handler in handlers:
+        handler.setLevel(NEVER)
     try:
-        client.wait_for_workers(1, timeout=FIRST_WORKER_S)
-    except TimeoutError as error:
-        raise FailureTwinError(
-            f"all workers have gone, and none came back within {FIRST_WORKER_S:g} s. Look for what "
-            "ended them, such as too little memory; start those of a scheduler again; and run the "
-            "same command again."
+        yield
+    finally:
+        for handler, level in zip(handlers, before, strict=True):
+            handler.setLevel(level)
+
+
+@contextmanager
+def _dask_client(workforce: Workforce) -> Iterator[Client]:
+    from distributed import Client
+
+    if workforce.scheduler is None:
+        client = Client(n_workers=workforce.workers, **OWN_WORKERS)
+    else:
+        client = _connected(workforce.scheduler)
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=FIRST_WORKER_S)
+        except TimeoutError as error:
+            raise InputError(
+                f"scheduler {workforce.scheduler!r} has no workers. Start some: dask worker "
+                f"{workforce.scheduler}"
+            ) from error
+        yield client
+
+
+def _connected(scheduler: str) -> Client:
+    from distributed import Client
+    from distributed.comm.addressing import get_address_host_port
+
+    try:
+        get_address_host_port(scheduler)  # a client with a wrong address never closes completely
+        return Client(scheduler, timeout=ANSWER_S, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(
+            f"scheduler {scheduler!r} does not answer ({_reason(error)}). Expected the address "
+            "that `dask scheduler` prints when it starts, such as tcp://host:8786."
         ) from error
 
 
-def _nothing_done() -> FailureTwinError:
-    return FailureTwinError(
-        f"workers are there, but finished nothing for {LONGEST_WAIT_S / 60:g} minutes. Look at "
-        "what they do, end them or start the scheduler again, and run the same command again."
-    )
+def _reason(error: BaseException) -> str:
+    """Return the message of an error of Dask, on one line."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
-def _result(future: Future[Result]) -> Result:
+def _results(client: Client, futures: deque[Future[Result]]) -> Iterator[Result]:
+    """Yield the results in order; futures are dropped with their results, to free memory."""
+    while futures:
+        yield _result(client, futures.popleft())
+
+
+def _result(client: Client, future: Future[Result]) -> Result:
     from distributed import CancelledError, KilledWorker
 
     try:
-        return future.result(timeout=LONGEST_WAIT_S)
-    except TimeoutError as error:
-        if future.status == "error":  # that of the work itself
-            raise
-        raise _nothing_done() from error  # it was lost with its worker, and is made again
+        return _waited_for(client, future)
     except KilledWorker as error:
         raise FailureTwinError(
             "workers died again and again over the same chunk. Look for what ends them, such as "
@@ -257,4 +182,30 @@ def _result(future: Future[Result]) -> Result:
         raise InputError(
             f"the workers cannot run failuretwin ({_reason(error)}). Install the same version "
             "there as here."
+        ) from error
+
+
+def _waited_for(client: Client, future: Future[Result]) -> Result:
+    """Return a result, with a time limit; one that is lost with its worker is made again."""
+    for _ in range(round(LONGEST_WAIT_S / LOOK_S)):
+        try:
+            return future.result(timeout=LOOK_S)
+        except TimeoutError:
+            if future.status == "error":  # that of the work itself
+                raise
+        _check_workers(client)
+    raise FailureTwinError(
+        f"workers are there, but finished nothing for {LONGEST_WAIT_S / 60:g} minutes. Look at "
+        "what they do, end them or start the scheduler again, and run the same command again."
+    )
+
+
+def _check_workers(client: Client) -> None:
+    try:
+        client.wait_for_workers(1, timeout=FIRST_WORKER_S)
+    except TimeoutError as error:
+        raise FailureTwinError(
+            f"all workers have gone, and none came back within {FIRST_WORKER_S:g} s. Look for what "
+            "ended them, such as too little memory; start those of a scheduler again; and run the "
+            "same command again."
         ) from error

@@ -15,9 +15,9 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements, stack_movements
 from failuretwin.core.runs import STEP_S
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.recovery.plane_arm import PlaneArm, plane_arm
-from failuretwin.data_knowledge.recovery.ramp_fit import PathPart, fit_run
-from failuretwin.data_knowledge.recovery.whole_counts import NoWholeUnitsError, solve_run
+from failuretwin.data_knowledge.recovery import ramp_fit
+from failuretwin.data_knowledge.recovery.ramp_fit import PathPart
+from failuretwin.data_knowledge.recovery.run_fit import NoWholeUnitsError, nearest_run, whole_run
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -54,10 +54,9 @@ def recover_movements(
     desired = as_floats(desired)
     grids = published_time_bases(np.shape(desired)[1]) if time is None else [as_floats(time)]
     _check(desired, grids[0], names)
-    arm = _arm_unless(robot, approximate=approximate)
-    grid = _fitting_grid(grids, desired, arm)
+    grid = _fitting_grid(grids, desired, robot)
     parts = [
-        _recover_run(PathPart(grid, path), robot, arm, approximate, name)
+        _recover_run(PathPart(grid, path), robot, approximate, name)
         for path, name in zip(desired, names, strict=True)
     ]
     return grid, stack_movements(parts)
@@ -74,8 +73,8 @@ def path_error(
         time: Time grid, (time,) [s].
         robot: The robot.
     """
-    off = DigitalTwin(robot).path(movements.reference(time)) - desired
-    return np.linalg.norm(off, axis=-1).max(axis=1, initial=0.0)
+    error = ramp_fit.path_error(movements, PathPart(time, desired), DigitalTwin(robot))
+    return error.max(axis=1, initial=0.0)
 
 
 def published_time_bases(samples: int) -> list[FloatArray]:
@@ -87,59 +86,41 @@ def published_time_bases(samples: int) -> list[FloatArray]:
     return [as_floats(np.arange(1, samples + 1) * STEP_S), np.linspace(0.0, end, samples)]
 
 
-def _fitting_grid(
-    grids: Sequence[FloatArray], desired: FloatArray, arm: PlaneArm | None
-) -> FloatArray:
+def _fitting_grid(grids: Sequence[FloatArray], desired: FloatArray, robot: Robot) -> FloatArray:
     """Return the grid on which movements of published durations make the desired paths.
 
     The grids differ in their step, which whole movements reveal; an offset of the whole run in
     time could not be seen. Runs whose movements are all cut off fit both. Where no run decides,
-    because none is exact or the robot is of another kind than the search for whole units can
-    handle, it is the first.
+    because none is exact, it is the first.
     """
-    if arm is None or len(grids) == 1:
+    if len(grids) == 1:
         return grids[0]
     for path in desired:
-        fitting = [grid for grid in grids if _is_exact(PathPart(grid, path), arm)]
+        fitting = [grid for grid in grids if _is_exact(PathPart(grid, path), robot)]
         if len(fitting) == 1:
             return fitting[0]
     return grids[0]
 
 
-def _is_exact(path: PathPart, arm: PlaneArm) -> bool:
+def _is_exact(path: PathPart, robot: Robot) -> bool:
     try:
-        solve_run(path, arm)
+        whole_run(path, robot)
     except NoWholeUnitsError:
         return False
     return True
 
 
-def _recover_run(
-    path: PathPart, robot: Robot, arm: PlaneArm | None, approximate: bool, name: str
-) -> Movements:
-    """Return the movements of one run; `arm` is None where whole units cannot be searched."""
-    if arm is not None:
-        try:
-            return solve_run(path, arm)
-        except NoWholeUnitsError as reason:
-            if not approximate:
-                raise InputError(
-                    f"run {name!r}: no movements of robot {robot.name!r} between whole servo "
-                    f"units make its desired path exactly: {reason}. If the path is of another "
-                    "robot, give that one with --robot; if its targets are no whole units or it "
-                    "holds noise, use --approximate."
-                ) from None
-    return fit_run(path, robot, name)
-
-
-def _arm_unless(robot: Robot, *, approximate: bool) -> PlaneArm | None:
-    """Return the arm to search, None where it cannot be searched and need not be."""
+def _recover_run(path: PathPart, robot: Robot, approximate: bool, name: str) -> Movements:
     try:
-        return plane_arm(robot)
-    except InputError:
-        if not approximate:
-            raise
-        return None
+        return whole_run(path, robot)
+    except NoWholeUnitsError as reason:
+        if approximate:
+            return nearest_run(path, robot, name)
+        raise InputError(
+            f"run {name!r}: no movements of robot {robot.name!r} between whole servo units make "
+            f"its desired path exactly: {reason}. If the path is of another robot, give that one "
+            "with --robot; if its targets are no whole units or it holds noise, use --approximate."
+        ) from None
 
 
 def _check(desired: FloatArray, time: FloatArray, names: Sequence[str]) -> None:

@@ -1,0 +1,440 @@
+"""Movements of one run from its tool path: ramps fitted one by one, then rounded or fitted at once.
+
+Every ramp is fitted by least squares from many first guesses: targets by inverse kinematics,
+durations at random. A path without noise then gives the poses and speeds, and every ramp is rounded
+to whole servo counts and published durations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.movements import Movements
+from failuretwin.core.types import FloatArray, frozen_array
+from failuretwin.data_knowledge.recovery.ramp_fit import (
+    PathPart,
+    fit,
+    path_error,
+    single_movements,
+)
+from failuretwin.digital_model.inverse_kinematics import InverseKinematics
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.failure_behavior.random_movements import RandomMovements
+
+Span = tuple[int, int]
+"""Last sample before a movement and first sample after it."""
+
+RAMP_S = frozen_array([s * RandomMovements().period_s for s in RandomMovements().ramp_shares])
+"""Durations of published ramps [s], the shortest first."""
+EXACT_M = 1e-9
+"""Largest distance of equal tool positions [m]; published paths are exact to 1e-15 m."""
+STAYS_RAD = 1e-6
+"""A motor with less travel [rad] does not move."""
+WHOLE_COUNTS = 0.1
+"""Largest distance of an angle that is rounded from its whole count [counts]."""
+EARLIEST_S = 0.1
+"""Longest time from the start of a ramp to the start of the record that cuts it [s]."""
+
+GUESSES = (6, 24, 96, 384)
+"""Numbers of first guesses of a ramp, tried until a fit is as good as the path."""
+MOST_MOTORS = 4
+"""Motors whose pose follows from a tool position and the count of the last one."""
+WHOLE_STARTS = 16
+"""First guesses of a pose for every count of the last motor."""
+OUTSIDE_FACTOR = 10.0
+"""Cost of an angle outside the range of random movements, relative to that of travel."""
+REACHED_M = 1e-3
+"""A pose this much worse than the best one [m] does not reach its point."""
+DURATION_SHARES = (0.6, 1.0)
+"""Range of guessed durations, as shares of the time in which the tool moves."""
+LEAST_DURATION_S = 0.02
+"""Shortest ramp in a fit [s]."""
+FIT_SAMPLES, REST_SAMPLES = 24, 5
+"""Samples for the fit of a ramp, and samples at rest on both sides of it."""
+RAMP_STEPS, START_STEPS, RUN_STEPS = 60, 8, 100
+"""Maximum number of steps of the fits of a ramp, its start and a run."""
+LEAST_GAIN = 1e-5
+"""Smallest relative decrease of the squared error in the fit of a run."""
+START_SHIFT_S = 0.15
+"""Largest change of a start in the fit of a run [s]."""
+SEEDS = (0, 1, 2)
+"""Seeds of the guesses for a run, each tried until the fit is as good as the path's noise."""
+EQUAL_SHARE = 0.1
+"""Fits that are worse by less than this share of the best are as good."""
+POOR_FIT_M = 0.01
+"""Largest rms error of a path made of movements [m]."""
+
+SMOOTH_SAMPLES = 10
+"""Samples of the moving average that shows movements in a noisy path."""
+NO_NOISE_M = 1e-7
+"""Less noise [m] does not count."""
+NOISE_FACTOR = 2.5
+"""Change of the average, in standard deviations of the noise, that counts as motion."""
+GOOD_FIT = 2.0
+"""Largest rms of a fit that is as good as the noise, in standard deviations of the noise."""
+LEAST_REST_S, LEAST_MOVEMENT_S = 0.3, 0.1
+"""Shorter rests belong to a movement, shorter movements to a rest [s]."""
+
+
+class NoWholeUnitsError(Exception):
+    """No movements between whole counts make the path; the text says where."""
+
+
+def whole_run(path: PathPart, robot: Robot) -> Movements:
+    """Return the movements between whole counts that make a path, with a leading run axis of 1.
+
+    A motor that stays has a duration of 0. Where the end of the record cuts off a ramp and several
+    targets and durations make the visible part, the result is one of these; where next to nothing
+    is visible, targets may lie between counts.
+
+    Raises:
+        NoWholeUnitsError: If no movements make this path.
+    """
+    if robot.profile.servo_units is None:
+        raise NoWholeUnitsError("the robot has no servo units")
+    run = _Run(path, DigitalTwin(robot), noise=0.0)
+    movements = run.whole()
+    error = path_error(movements, path, run.twin)[0]
+    if error.max() > EXACT_M:
+        at = path.time[error.argmax()]
+        raise NoWholeUnitsError(f"at {at:.2f} s the tool does not rest where it should")
+    return movements
+
+
+def nearest_run(path: PathPart, robot: Robot, name: str) -> Movements:
+    """Return the movements that fit a path best, with a leading run axis of 1.
+
+    Args:
+        path: The desired path of the run.
+        robot: The robot.
+        name: Name of the run, for messages.
+
+    Raises:
+        InputError: If no movements make anything like the path.
+    """
+    best, least = None, np.inf
+    for seed in SEEDS:
+        run = _Run(path, DigitalTwin(robot), _noise(path), np.random.default_rng(seed))
+        movements = run.nearest()
+        rms = float(_rms(path_error(movements, path, run.twin))[0])
+        if rms < least:
+            best, least = movements, rms
+        if least <= run.good:
+            break
+    if best is None or least > POOR_FIT_M:
+        raise InputError(
+            f"run {name!r}: the best movements of robot {robot.name!r} are {least:.3f} m (rms) off "
+            "its desired path. Expected ramps that all motors start together, with rests of "
+            f"{LEAST_REST_S} s or more between them; give the robot it is of with --robot."
+        )
+    return best
+
+
+def _noise(path: PathPart) -> float:
+    """Return the standard deviation of a path's noise on each axis [m].
+
+    The lower quartile of second differences, 0.32 sqrt(6) deviations, counts the samples at rest.
+    """
+    bends = np.abs(np.diff(path.point, 2, axis=0))
+    return float(np.quantile(bends, 0.25) / (0.32 * np.sqrt(6.0))) if bends.size else 0.0
+
+
+def _rms(error: FloatArray) -> FloatArray:
+    return np.sqrt(np.mean(error**2, axis=-1))
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Fits of one run.
+
+    Attributes:
+        path: The desired path.
+        twin: Kinematics.
+        noise: Standard deviation of the path's noise on each axis [m].
+        rng: Draws first guesses.
+    """
+
+    path: PathPart
+    twin: DigitalTwin
+    noise: float
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+
+    @cached_property
+    def kinematics(self) -> InverseKinematics:
+        return InverseKinematics.of(self.twin.robot)
+
+    @property
+    def good(self) -> float:
+        """Largest rms error of a fit that is as good as the path [m]."""
+        return GOOD_FIT * np.sqrt(3.0) * self.noise + NO_NOISE_M
+
+    @cached_property
+    def spans(self) -> list[Span]:
+        """Samples around every movement that stands out of the noise."""
+        time, point, end = self.path.time, self.path.point, len(self.path.time) - 1
+        width = SMOOTH_SAMPLES if self.noise > NO_NOISE_M and end >= 3 * SMOOTH_SAMPLES else 1
+        average = [np.convolve(axis, np.full(width, 1.0 / width), "valid") for axis in point.T]
+        smooth = np.stack(average, axis=1)
+        change = np.linalg.norm(smooth[width:] - smooth[:-width], axis=1)
+        moving = change > max(NOISE_FACTOR * self.noise, NO_NOISE_M)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], moving.astype(int), [0]])))
+        spans: list[Span] = []
+        for first, last in edges.reshape(-1, 2).tolist():
+            # A change between two averages shows up to two widths before it begins.
+            begin, stop = min(first + width - 1, last), min(last + width - 1, end)
+            if spans and time[begin] - time[spans[-1][1]] < LEAST_REST_S:
+                begin = spans.pop()[0]
+            spans.append((begin, stop))
+        return [s for s in spans if time[s[1]] - time[s[0]] >= LEAST_MOVEMENT_S or s[1] == end]
+
+    @cached_property
+    def rests(self) -> list[FloatArray]:
+        """Median tool position in every rest, (axis,) [m]; the last point if the record ends."""
+        begins = [0, *(last for _, last in self.spans)]
+        ends = [*(first for first, _ in self.spans), len(self.path.time) - 1]
+        return [
+            np.median(self.path.point[begin : max(begin, end) + 1], axis=0)
+            for begin, end in zip(begins, ends, strict=True)
+        ]
+
+    # Movements between whole counts.
+
+    def whole(self) -> Movements:
+        if not self.spans:
+            return self._joined(self._whole_poses(self.path.point[0])[:1], [])
+        if self.spans == [(0, len(self.path.time) - 1)]:
+            raise NoWholeUnitsError("the record holds no settled pose")
+        return self._chain(self._whole_ramps)
+
+    def _whole_poses(self, point: FloatArray) -> FloatArray:
+        """Return the poses in whole counts at a point, (pose, motor) [rad], usual ones first.
+
+        Every count of the last motor is tried; inverse kinematics gives the other motors.
+
+        Raises:
+            NoWholeUnitsError: If there are none.
+        """
+        units, zero = self.twin.robot.servo_units, self._zero
+        low, high = self._whole_limits
+        last = units.to_rad(np.arange(low[-1], high[-1] + 1.0))
+        starts = self.kinematics.starts(WHOLE_STARTS * len(last), self.rng)
+        starts[:, -1] = np.tile(last, WHOLE_STARTS)
+        locked = np.arange(len(zero)) == len(zero) - 1
+        goals = np.broadcast_to(point, (len(starts), 3))
+        found = self.kinematics.solve(goals, starts[:, None], locked).pose[:, 0]
+        whole = np.unique(np.round(units.to_counts(np.concatenate([found, zero[None]]))), axis=0)
+        poses = units.to_rad(whole[((whole >= low) & (whole <= high)).all(axis=1)])
+        poses = poses[np.linalg.norm(self.twin.path(poses) - point, axis=1) <= 2.0 * EXACT_M]
+        if not len(poses):
+            raise NoWholeUnitsError("no pose in whole servo units puts the tool where it rests")
+        return poses[np.argsort(self._cost(poses, zero), kind="stable")]
+
+    def _whole_ramps(self, m: int, origins: FloatArray | None) -> Movements:
+        """Return the ramps between whole counts that make movement `m`.
+
+        Raises:
+            NoWholeUnitsError: If there are none.
+        """
+        part = self._part(m)
+        for fitted in self._fits(m, origins):
+            error = path_error(fitted, part, self.twin).max(axis=1)
+            best = int(error.argmin())
+            near = fitted[best : best + 1]
+            whole = self._rounded(near, part, origins is None)
+            if len(whole.start):
+                return whole
+            if error[best] <= EXACT_M and self._is_cut_off(m):
+                return near  # too little of it is seen to tell its speeds
+        at = self.path.time[self.spans[m][0]]
+        raise NoWholeUnitsError(
+            f"no start and durations of the published kind make the movement at {at:.2f} s"
+        )
+
+    def _fits(self, m: int, origins: FloatArray | None) -> Iterator[Movements]:
+        """Yield fits of movement `m` from ever more guesses, then those to whole targets.
+
+        A ramp may leave poses open, such as one of the first motor alone, or nearly so, such as one
+        from a stretched arm.
+        """
+        for count in GUESSES:
+            yield self._fitted(m, origins, None, count)
+        if not self._is_cut_off(m) and len(self._zero) <= MOST_MOTORS:
+            yield self._fitted(m, origins, self._whole_poses(self.rests[m + 1]), GUESSES[-1])
+
+    def _rounded(self, ramp: Movements, part: PathPart, free_origin: bool) -> Movements:
+        """Return the exact ramps of published durations to whole counts near a fitted ramp.
+
+        The speeds of the ramp hold: target = origin + speed * duration. If it is under way when the
+        record begins, the target holds and the origin follows.
+        """
+        units = self.twin.robot.servo_units
+        origin, target, fitted = ramp.initial[0], ramp.target[0, 0], ramp.ramp_duration[0, 0]
+        moves = np.abs(target - origin) > STAYS_RAD
+        speed = np.where(moves, (target - origin) / fitted, 0.0)
+        duration = np.array(list(product(*(RAMP_S if one else RAMP_S[:1] for one in moves))))
+        start = np.full(len(duration), ramp.start[0, 0])
+        begun = free_origin and start[0] <= part.time[0] + 1e-6
+        if begun:
+            origin = target - speed * duration
+            start += np.mean((fitted - duration)[:, moves], axis=1)
+        else:
+            target = origin + speed * duration
+        counts = units.to_counts(np.stack(np.broadcast_arrays(origin, target)))
+        whole = np.round(counts)
+        low, high = self._whole_limits
+        kept = (np.abs(whole - counts) <= WHOLE_COUNTS) & (whole >= low) & (whole <= high)
+        good = kept.all(axis=(0, 2)) & (start >= part.time[0] - EARLIEST_S)
+        origin, target = units.to_rad(whole[:, good])
+        guesses = single_movements(origin, target, duration[good], start[good])
+        if not good.any():
+            return guesses
+        fixed = np.zeros(3 * len(speed), dtype=np.bool_)
+        found = fit(guesses, part, self.twin, fixed, START_STEPS)
+        found = found[path_error(found, part, self.twin).max(axis=1) <= EXACT_M]
+        return found[np.argsort(self._cost(found.target[:, 0], ramp.target[0, 0]), kind="stable")]
+
+    @cached_property
+    def _whole_limits(self) -> FloatArray:
+        """Lowest and highest whole count of every motor, (2, motor)."""
+        ends = np.stack([self.kinematics.low, self.kinematics.high])
+        low, high = np.sort(self.twin.robot.servo_units.to_counts(ends), axis=0)
+        return np.stack([np.ceil(low - 1e-9), np.floor(high + 1e-9)])
+
+    # Movements of any kind.
+
+    def nearest(self) -> Movements:
+        if not self.spans:
+            poses = self._poses(self.rests[0], GUESSES[0])
+            return self._joined(poses[[np.argmin(self._cost(poses, self._zero))]], [])
+        return self._together(self._chain(self._nearest_ramps))
+
+    def _nearest_ramps(self, m: int, origins: FloatArray | None) -> Movements:
+        """Return the ramps that fit movement `m` as well as the best, least travel first."""
+        for count in GUESSES[1:]:
+            fitted = self._fitted(m, origins, None, count)
+            rms = _rms(path_error(fitted, self._part(m), self.twin))
+            if rms.min() <= self.good:
+                break
+        fitted = fitted[rms <= rms.min() * (1.0 + EQUAL_SHARE) + NO_NOISE_M]
+        origin, target = fitted.initial, fitted.target[:, 0]
+        cost = self._cost(target, origin) + np.linalg.norm(origin, axis=1)
+        return fitted[np.argsort(cost, kind="stable")]
+
+    def _together(self, guess: Movements) -> Movements:
+        """Return all movements of the run fitted at once."""
+        count, motors = guess.target.shape[1:]
+        begun = np.maximum.accumulate(guess.start[0])
+        longest = np.diff(begun, append=np.inf).clip(2.0 * LEAST_DURATION_S)
+        low = [np.tile(self.kinematics.low, count + 1), np.full(count * motors, LEAST_DURATION_S)]
+        high = [np.tile(self.kinematics.high, count + 1), np.repeat(longest, motors)]
+        limits = (
+            np.concatenate([*low, begun - START_SHIFT_S]),
+            np.concatenate([*high, begun + START_SHIFT_S]),
+        )
+        free = np.full((1 + 2 * count) * motors, True)
+        fitted = fit(guess, self.path, self.twin, free, RUN_STEPS, limits, LEAST_GAIN)
+        return _without_idle_ramps(fitted)
+
+    # Both.
+
+    def _chain(self, ramps_of: Callable[[int, FloatArray | None], Movements]) -> Movements:
+        """Return movements whose origins are the targets before them.
+
+        Where a ramp leaves its target open, the next one decides.
+
+        Args:
+            ramps_of: Possible ramps of a movement, the best first, from some origins (pose, motor)
+                [rad]; None: free.
+        """
+        found = [ramps_of(0, None)]
+        for m in range(1, len(self.spans)):
+            found.append(ramps_of(m, np.unique(found[-1].target[:, 0], axis=0)))
+        chain = [found.pop()[:1]]
+        while found:
+            leads = (found[-1].target[:, 0] == chain[0].initial).all(axis=1)
+            chain.insert(0, found.pop()[leads][:1])
+        return self._joined(chain[0].initial, chain)
+
+    @cached_property
+    def _usual(self) -> FloatArray:
+        """Lowest and highest angles of random movements, (2, motor) [rad]."""
+        return np.array([motor.movement_range for motor in self.twin.robot.motors]).T
+
+    @property
+    def _zero(self) -> FloatArray:
+        return np.zeros(len(self.twin.robot.motors))
+
+    def _is_cut_off(self, m: int) -> bool:
+        return self.spans[m][1] == len(self.path.time) - 1
+
+    def _part(self, m: int) -> PathPart:
+        """Return samples of movement `m` and of the rests around it."""
+        first, last = self.spans[m]
+        before = self.spans[m - 1][1] if m else 0
+        after = self.spans[m + 1][0] if m + 1 < len(self.spans) else len(self.path.time) - 1
+        first, last = max(first - REST_SAMPLES, before), min(last + REST_SAMPLES, after)
+        return self.path.take(slice(first, last + 1)).thinned(FIT_SAMPLES)
+
+    def _poses(self, point: FloatArray, count: int) -> FloatArray:
+        """Return poses all over the arm's range at a point, (pose, motor) [rad]."""
+        low, high = self._usual
+        drawn = self.rng.uniform(low, high, (4 * count, len(low)))
+        found = self.kinematics.solve(point[None], np.concatenate([self._zero[None], drawn]))
+        return found.pose[0][found.miss_m[0] <= found.miss_m.min() + REACHED_M]
+
+    def _cost(self, poses: FloatArray, near: FloatArray) -> FloatArray:
+        """Return travel to poses (pose, motor), and more outside the usual range, (pose,) [rad]."""
+        low, high = self._usual
+        outside = np.maximum(low - poses, poses - high).clip(0.0).sum(axis=1)
+        return np.linalg.norm(poses - near, axis=1) + OUTSIDE_FACTOR * outside
+
+    def _fitted(
+        self, m: int, origins: FloatArray | None, targets: FloatArray | None, count: int
+    ) -> Movements:
+        """Return fits of movement `m` from `count` first guesses.
+
+        Args:
+            m: Number of the movement.
+            origins: Possible poses before it, (pose, motor) [rad]; None: free, any in the rest.
+            targets: Possible poses after it, likewise.
+            count: Number of guesses.
+        """
+        origin, target = (
+            self.rng.choice(self._poses(rest, count) if poses is None else poses, count)
+            for poses, rest in zip((origins, targets), self.rests[m : m + 2], strict=True)
+        )
+        first, last = self.path.time[list(self.spans[m])]
+        duration = self.rng.uniform(*DURATION_SHARES, origin.shape) * (last - first)
+        step = self.path.time[1] - self.path.time[0]
+        guesses = single_movements(origin, target, duration, first + 0.5 * step)
+        motors = origin.shape[1]
+        least = np.repeat([-np.inf, 0.0, -np.inf], [2 * motors, motors, 1])
+        most = np.repeat([np.inf, last - first, np.inf], [2 * motors, motors, 1])
+        free = np.repeat([origins is None, targets is None, True], motors)
+        return fit(
+            guesses, self._part(m), self.twin, free, RAMP_STEPS, (least, most), one_is_enough=True
+        )
+
+    def _joined(self, initial: FloatArray, ramps: Sequence[Movements]) -> Movements:
+        """Return one run from the pose `initial` (1, motor) with the movements of all ramps."""
+        none = Movements.empty(run=1, movement=0, motor=initial.shape[1])
+        parts = [none, *ramps]
+        target, duration, start = (
+            np.concatenate([getattr(part, name) for part in parts], axis=1)
+            for name in ("target", "ramp_duration", "start")
+        )
+        return _without_idle_ramps(Movements(initial, target, duration, start))
+
+
+def _without_idle_ramps(movements: Movements) -> Movements:
+    """Return the movements with a duration of 0 for motors that stay."""
+    poses = np.concatenate([movements.initial[:, None], movements.target], axis=1)
+    idle = np.abs(np.diff(poses, axis=1)) <= STAYS_RAD
+    return replace(movements, ramp_duration=np.where(idle, 0.0, movements.ramp_duration))
