@@ -60,7 +60,7 @@ def test_diagnoses_are_evaluated_as_they_come():
     assert scores.alarms.faulty_abstained == 1
     assert scores.calibration.equal.error == pytest.approx(0.75 - 2 / 3)
     assert scores.coverage == []
-    assert scores.judged.protocol == "P0"
+    assert scores.scores.protocol == "P0"
 
 
 def test_a_run_set_knows_the_truth_and_what_intervals_should_hold(runs):

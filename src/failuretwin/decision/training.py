@@ -18,7 +18,6 @@ from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.core.runs import RunTable, concatenate
 from failuretwin.core.types import IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
-from failuretwin.decision.evaluation import Judged
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
 from failuretwin.decision.learned.feature_encoder import (
     FeatureEncoder,
@@ -352,7 +351,7 @@ def train_network(
     _calibrate(network, bayes, other.run_set(0, half))
     judges = other.run_set(1, half)
     both = HybridDiagnoser(bayes, network, network.weights_, class_name(bayes.twin.robot))
-    alone, pooled = (Judged.of(d.diagnose(judges)).scores for d in (network, both))
+    alone, pooled = (Scores.of(d.diagnose(judges)) for d in (network, both))
     return network, alone, pooled
 
 

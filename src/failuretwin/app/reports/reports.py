@@ -17,7 +17,6 @@ from failuretwin.decision.evaluation import (
     Calibration,
     Comparison,
     Evaluation,
-    Judged,
     as_unknown_line,
     is_right,
     score_line,
@@ -73,24 +72,23 @@ def course_lines(course: FaultCourse | None, state: RobotState, robot: Robot) ->
     return [*told, f"what to do: {state.step}"]
 
 
-def print_scores(judged: Judged) -> None:
+def print_scores(scores: scoring.Scores) -> None:
     """Print how good the diagnoses are, if the truth of any run is known."""
-    if not judged.diagnoses:
+    if not scores.runs:
         return
-    show(f"\n{score_line(judged)}")
-    if judged.as_unknown:
-        show(as_unknown_line(judged))
-    show("", class_table(judged.scores), "", _confusion_table(judged.scores))
+    show(f"\n{score_line(scores)}")
+    if scores.as_unknown:
+        show(as_unknown_line(scores))
+    show("", class_table(scores), "", _confusion_table(scores))
 
 
 def class_table(scores: scoring.Scores) -> Table:
     """Return precision, recall and F1 of each class."""
+    counts, ratios = scores.confusion.sum(axis=1), scoring.class_ratios(scores.confusion)
+    rows = zip(scores.classes, counts, ratios, strict=True)
     return figures_table(
         ("class", "runs", "precision", "recall", "F1"),
-        [
-            (row.name, str(row.runs), *(f"{v:.3f}" for v in (row.precision, row.recall, row.f1)))
-            for row in scores.by_class()
-        ],
+        [(name, str(runs), *(f"{value:.3f}" for value in values)) for name, runs, values in rows],
     )
 
 
@@ -110,7 +108,7 @@ def _confusion_table(scores: scoring.Scores) -> Table:
 
 def print_evaluation(evaluation: Evaluation, truth_given: bool) -> None:
     """Print every score; without a run set given, no true onset or magnitude can be known."""
-    print_scores(evaluation.judged)
+    print_scores(evaluation.scores)
     show(f"\nall {evaluation.runs_and_protocol}", summary_table(evaluation))
     if evaluation.calibration is not None:
         show("", _reliability_table(evaluation.calibration.equal))
@@ -127,7 +125,7 @@ def summary_table(evaluation: Evaluation) -> Table:
     scores, alarms = evaluation.scores, evaluation.alarms
     false_alarms = _percent(alarms.false_alarms) + _abstained(alarms.healthy_abstained)
     rows = [
-        ("accuracy", _percent(scoring.Share(scores.right, scores.runs))),
+        ("accuracy", _percent(scores.share)),
         ("macro-F1", f"{scores.macro_f1:.3f}, mean over the classes that were true of any run"),
         ("false-alarm rate", false_alarms),
         ("missed-detection rate", _percent(alarms.missed) + _abstained(alarms.faulty_abstained)),
@@ -212,10 +210,11 @@ def comparison_rows(comparison: Comparison) -> list[tuple[str, str]]:
         unknown = f"by A {a} runs, by B {b}: their truth is not among its hypotheses"
         rows.append(("judged as unknown", unknown))
     gain = comparison.gain
-    if gain.first_impossible or gain.second_impossible or gain.both_impossible:
+    none = gain.impossible
+    if gain.runs < comparison.runs:
         impossible = (
-            f"only by A in {gain.first_impossible} runs, only by B in {gain.second_impossible}, by "
-            f"both in {gain.both_impossible}"
+            f"only by A in {none.first_only} runs, only by B in {none.second_only}, by both in "
+            f"{none.both}"
         )
         rows.append(("truth given no probability", impossible))
         rows.append(("log score, A minus B, all runs", f"{gain.mean:+.3f} nats a run"))
@@ -233,7 +232,7 @@ def comparison_rows(comparison: Comparison) -> list[tuple[str, str]]:
 def write_latex(evaluation: Evaluation, comparison: Comparison | None, path: Path) -> None:
     """Write all scores, those of each class, coverage and the comparison, as tables for a paper."""
     summary, classes = summary_table(evaluation), class_table(evaluation.scores)
-    if count := sum(evaluation.judged.as_unknown.values()):
+    if count := sum(evaluation.scores.as_unknown.values()):
         unknown = f"{count} runs, whose truth is not among the hypotheses"
         summary = replace(summary, rows=[*summary.rows, ("judged as unknown", unknown)])
     dashes = [["--" if cell == "nan" else cell for cell in row] for row in classes.rows]
