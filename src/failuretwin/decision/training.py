@@ -23,7 +23,6 @@ from failuretwin.decision.learned.feature_encoder import (
     FeatureEncoder,
     Floats,
     expectation_of,
-    signals_of,
 )
 from failuretwin.decision.learned.log_pool import HybridDiagnoser, fit_pool_weights
 from failuretwin.decision.learned.networks import Batch, Standard, epoch
@@ -114,7 +113,7 @@ class TrainingData:
 
         Chunks of different numbers share no runs; variants are equally frequent in each.
         """
-        made = [(at, encoder.encode(signals_of(table))) for at, table in self._made(number, runs)]
+        made = [(at, encoder.encode(table)) for at, table in self._made(number, runs)]
         order, features = (np.concatenate(parts) for parts in zip(*made, strict=True))
         shuffled = np.random.default_rng([self.seed, number, 1]).permutation(runs)
         return features[shuffled], self._classes(number, runs)[order[shuffled]]

@@ -1,6 +1,7 @@
 """The networks and their training loop: the paper's LSTM, a CNN, and a motor-wise CNN.
 
-Each maps standardised features (run, point, channel) to logits (run, class).
+Each maps standardised features (run, point, channel) to logits (run, class). A trained network is
+the sequence of a `Standard` and one of them.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from failuretwin.core.errors import unknown_name
@@ -45,6 +45,35 @@ class Shape:
     classes: int
     motors: int = 1
     shared: int = 0
+
+
+class Standard(nn.Module):
+    """Standardisation of each channel to zero mean and unit variance.
+
+    Attributes:
+        mean: (channel,).
+        spread: Standard deviation, (channel,); 1 for a constant channel.
+    """
+
+    mean: Tensor
+    spread: Tensor
+
+    def __init__(self, mean: Floats, spread: Floats) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.from_numpy(mean))
+        self.register_buffer("spread", torch.from_numpy(spread))
+
+    @classmethod
+    def of(cls, features: Floats) -> Standard:
+        """Return the standardisation fitted to features (run, point, channel)."""
+        flat = features.reshape(-1, features.shape[-1]).astype(np.float64)
+        spread = flat.std(axis=0)
+        spread[spread < 1e-12] = 1.0
+        return cls(flat.mean(axis=0).astype(np.float32), spread.astype(np.float32))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Return standardised features."""
+        return (features - self.mean) / self.spread
 
 
 class PaperLstm(nn.Module):
@@ -162,7 +191,7 @@ def build_network(name: str, shape: Shape) -> nn.Module:
 # Training loop.
 
 Batch = tuple[Floats, IntArray]
-"""Standardised features (run, point, channel) and classes (run,)."""
+"""Features (run, point, channel) and classes (run,)."""
 
 EVALUATED_RUNS = 512
 """Runs evaluated at a time."""
@@ -243,28 +272,3 @@ def epoch(
     for first in range(0, len(order) - size + 1, size):
         chosen = order[first : first + size]
         yield features[chosen], classes[chosen]
-
-
-@dataclass(frozen=True)
-class Standard:
-    """Standardisation of each channel to zero mean and unit variance.
-
-    Attributes:
-        mean: (channel,).
-        spread: Standard deviation, (channel,); 1 for a constant channel.
-    """
-
-    mean: NDArray[np.float32]
-    spread: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, features: Floats) -> Standard:
-        """Return the standardisation fitted to features (run, point, channel)."""
-        flat = features.reshape(-1, features.shape[-1]).astype(np.float64)
-        spread = flat.std(axis=0)
-        spread[spread < 1e-12] = 1.0
-        return cls(flat.mean(axis=0).astype(np.float32), spread.astype(np.float32))
-
-    def __call__(self, features: Floats) -> Floats:
-        """Return standardised features."""
-        return (features - self.mean) / self.spread
