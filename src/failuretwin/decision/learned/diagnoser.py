@@ -31,7 +31,6 @@ from failuretwin.decision.learned.feature_encoder import (
 from failuretwin.decision.learned.log_pool import PoolWeights
 from failuretwin.decision.learned.networks import (
     Batch,
-    Pace,
     Shape,
     Standard,
     build_network,
@@ -144,8 +143,8 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             network = self.untrained(standard, len(classes))
-            pace = Pace(self.iterations, self.learning_rate, self.decay)
-            for done in training(network, batches, pace):
+            pace = self.iterations, self.learning_rate, self.decay
+            for done in training(network, batches, *pace):
                 on_iteration(done)
         self.network_ = network.cpu()
         self.classes_, self.temperature_ = classes, 1.0

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR
 
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray, IntArray
@@ -197,50 +198,44 @@ EVALUATED_RUNS = 512
 """Runs evaluated at a time."""
 
 
-@dataclass(frozen=True)
-class Pace:
-    """Settings of Adam with cross-entropy loss.
-
-    Attributes:
-        iterations: Number of batches.
-        learning_rate: Initial learning rate.
-        decay: Whether the rate falls to zero along half a cosine.
-    """
-
-    iterations: int
-    learning_rate: float = 1e-3
-    decay: bool = False
-
-    def rate(self, done: int) -> float:
-        """Return the learning rate after some iterations."""
-        share = 0.5 * (1.0 + math.cos(math.pi * done / self.iterations)) if self.decay else 1.0
-        return self.learning_rate * share
-
-
 def device() -> torch.device:
     """Return the training device: a GPU if there is one."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def training(network: nn.Module, batches: Iterable[Batch], pace: Pace) -> Iterator[int]:
-    """Train a network in place; yield the number of iterations after each.
+def half_cosine(share: float) -> float:
+    """Return the factor on the learning rate after a share of the iterations, 1 to 0."""
+    return 0.5 * (1.0 + math.cos(math.pi * share))
 
-    Needs at least as many batches as `pace` has iterations.
+
+def training(
+    network: nn.Module,
+    batches: Iterable[Batch],
+    iterations: int,
+    learning_rate: float = 1e-3,
+    decay: bool = False,
+) -> Iterator[int]:
+    """Train a network in place by Adam with cross-entropy loss; yield the iterations after each.
+
+    Args:
+        network: Maps features to logits.
+        batches: At least as many as there are iterations.
+        iterations: Number of batches.
+        learning_rate: Initial learning rate.
+        decay: Whether the rate falls to zero along half a cosine.
     """
     where = device()
     network.to(where)
-    optimizer = torch.optim.Adam(network.parameters(), lr=pace.learning_rate)
+    optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate)
+    rate = LambdaLR(optimizer, lambda done: half_cosine(done / iterations) if decay else 1.0)
     measure = nn.CrossEntropyLoss()
-    source = iter(batches)
-    for done in range(pace.iterations):
-        features, classes = next(source)
-        optimizer.param_groups[0]["lr"] = pace.rate(done)
+    for done, (features, classes) in zip(range(iterations), batches, strict=False):
         network.train()
         optimizer.zero_grad()
         scores = network(torch.from_numpy(features).to(where))
-        loss = measure(scores, torch.from_numpy(classes).to(where))
-        loss.backward()
+        measure(scores, torch.from_numpy(classes).to(where)).backward()
         optimizer.step()
+        rate.step()
         yield done + 1
 
 

@@ -250,8 +250,7 @@ def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
     batches = networks.shuffled_batches(*sets["training"], BATCH_RUNS, rng)
     accuracies: dict[str, tuple[float, ...]] = dict.fromkeys(sets, ())
     confusion = np.zeros((classes, classes), dtype=np.int64)
-    pace = networks.Pace(plan.iterations, job.learning_rate)
-    for iteration in networks.training(network, batches, pace):
+    for iteration in networks.training(network, batches, plan.iterations, job.learning_rate):
         if iteration in plan.checkpoints:
             for name, (features, truth) in sets.items():
                 diagnosis = networks.scores_of(network, features).argmax(axis=1)
@@ -375,11 +374,10 @@ def run_study(
 
 def _manifest(plan: StudyPlan, robot: Robot, test: Exam) -> dict[str, Any]:
     """Return everything that determines the figures of the study."""
+    sizes = asdict(plan) | {"checkpoints": list(plan.checkpoints)}
+    del sizes["stand_in_runs"]  # part of the test set
     return {
-        "seed": plan.seed,
-        "runs_per_class": plan.runs_per_class,
-        "checkpoints": list(plan.checkpoints),
-        "repeats": plan.repeats,
+        **sizes,
         "robot": fingerprint(robot),
         "test": test.source,
         "test_sha256": _digest(test),
