@@ -11,7 +11,6 @@ from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_
 
 from failuretwin.decision.scoring import (
     NO_VERDICT,
-    Alarms,
     Coverage,
     IntervalCase,
     Scores,
@@ -131,18 +130,19 @@ def test_a_share_of_nothing_is_not_known():
 
 
 def test_any_other_verdict_on_a_healthy_run_is_a_false_alarm():
-    alarms = Alarms.of(["healthy"] * 5, ["healthy", "motor_1:stuck", "unknown", None, "healthy"])
-    assert alarms.false_alarms == Share(2, 5)
-    assert alarms.healthy_abstained == 1
-    assert alarms.missed == Share(0, 0)
+    said = ["healthy", "motor_1:stuck", "unknown", None, "healthy"]
+    scores = Scores(["healthy"] * 5, said, [{}] * 5)
+    assert scores.false_alarms == Share(2, 5)
+    assert scores.abstained == (1, 0)
+    assert scores.missed == Share(0, 0)
 
 
 def test_a_fault_is_missed_where_no_alarm_is_raised_whatever_its_name():
     said = ["motor_1:stuck", "motor_2:stuck", "unknown", "healthy", None, None]
-    alarms = Alarms.of(["motor_1:stuck"] * 5 + ["unknown"], said)
-    assert alarms.missed == Share(3, 6)
-    assert alarms.faulty_abstained == 2
-    assert alarms.false_alarms == Share(0, 0)
+    scores = Scores(["motor_1:stuck"] * 5 + ["unknown"], said, [{}] * 6)
+    assert scores.missed == Share(3, 6)
+    assert scores.abstained == (0, 2)
+    assert scores.false_alarms == Share(0, 0)
 
 
 def test_truths_are_counted_on_either_side():

@@ -15,11 +15,16 @@ import numpy as np
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import truth_of
-from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
-from failuretwin.decision import scoring
 from failuretwin.decision.results import Record, Results, read_results, some_names
-from failuretwin.decision.scoring import Scores
+from failuretwin.decision.scoring import (
+    IntervalCase,
+    LogScoreGain,
+    Scores,
+    Split,
+    judged_truth,
+    log_score_gain,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -92,16 +97,6 @@ def _truths(given: RunsLike | Truths | None, results: Results) -> Truths:
     return given if isinstance(given, Truths) else Truths.of(as_runs(given))
 
 
-def _judged(diagnoses: Iterable[Diagnosis | Record], name: str) -> Scores:
-    """Return scores of diagnoses; at least one must carry its truth."""
-    scores = Scores.of(diagnoses)
-    if not scores.runs:
-        raise InputError(
-            f"{name}: no run says what was true. Give a run set that does with --truth RUNS."
-        )
-    return scores
-
-
 def as_results(given: Given, name: str = "the results") -> Results:
     """Return diagnoses as `Results`; a path is read."""
     if isinstance(given, str | Path):
@@ -116,14 +111,14 @@ def is_right(diagnosis: Diagnosis | Record) -> bool | None:
     """Return whether a verdict is correct; None without a verdict or a known truth."""
     if diagnosis.truth is None or diagnosis.diagnosis is None:
         return None
-    return diagnosis.diagnosis == scoring.judged_truth(diagnosis.truth, diagnosis.posterior)
+    return diagnosis.diagnosis == judged_truth(diagnosis.truth, diagnosis.posterior)
 
 
 def score_line(scores: Scores) -> str:
     """Return accuracy, interval, protocol and log score in one line; empty if there is no truth."""
     if not scores.runs:
         return ""
-    low, high = scores.share.interval
+    low, high = scores.interval
     return (
         f"{scores.right} of {counted(scores.runs, 'run')} right: accuracy "
         f"{100 * scores.accuracy:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f} "
@@ -154,54 +149,13 @@ def as_unknown_line(scores: Scores) -> str:
 # Scores of one method.
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """Reliability of the verdict's probability, in equal and in adaptive bins.
-
-    `by_chance` holds the errors of a perfectly calibrated method in equal bins, (draw,).
-    """
-
-    equal: scoring.Reliability
-    adaptive: scoring.Reliability
-    by_chance: FloatArray
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Scores of diagnoses whose truth is known.
-
-    Attributes:
-        scores: Accuracy, confusion matrix and log score.
-        alarms: False alarms and missed detections.
-        brier: Mean Brier score, 0 to 2.
-        calibration: Of runs with a verdict; None if there are none.
-        coverage: Coverage of 90 % intervals by fault mode; empty where true values are unknown.
-    """
-
-    scores: Scores
-    alarms: scoring.Alarms
-    brier: float
-    calibration: Calibration | None
-    coverage: Sequence[scoring.Coverage]
-
-    @property
-    def runs_and_protocol(self) -> str:
-        """Number of runs and protocol, as text."""
-        return f"{counted(self.scores.runs, 'run')}, protocol {self.scores.protocol}"
-
-
-def evaluate(
-    results: Given,
-    truth: RunsLike | Truths | None = None,
-    rng: np.random.Generator | None = None,
-) -> Evaluation:
+def evaluate(results: Given, truth: RunsLike | Truths | None = None) -> Scores:
     """Return all scores of the diagnoses whose truth is known.
 
     Args:
         results: Diagnoses, results, or the path of a results file.
         truth: Run set with the truth, or its path; None: the truth in the diagnoses, without
             coverage of intervals.
-        rng: Random generator for the calibration error by chance; None: seed 0.
 
     Raises:
         InputError: If no truth is known, or a run is missing from `truth` or given twice.
@@ -209,32 +163,23 @@ def evaluate(
     given = as_results(results)
     truths = _truths(truth, given)
     told = truths.told(given.diagnoses)
-    scores = _judged(told, given.name)
-    found = (d for d in told if is_right(d))
-    return Evaluation(
-        scores=scores,
-        alarms=scoring.Alarms.of(scores.truth, scores.verdicts),
-        brier=float(scoring.brier_score(scores.truth, scores.posteriors).mean()),
-        calibration=_calibration(scores, rng or np.random.default_rng(0)),
-        coverage=scoring.coverage_by_mode(c for d in found for c in _cases(d, truths[d.run])),
-    )
+    cases = [case for d in told if is_right(d) for case in _cases(d, truths[d.run])]
+    return _judged(told, given.name, cases)
 
 
-def _calibration(scores: Scores, rng: np.random.Generator) -> Calibration | None:
-    rows = zip(scores.verdicts, scores.posteriors, scores.hits, strict=True)
-    pairs = [(p[verdict], hit) for verdict, p, hit in rows if verdict is not None]
-    if not pairs:
-        return None
-    stated, right = (np.array(column) for column in zip(*pairs, strict=True))
-    stated = np.minimum(stated, 1.0)  # sums may round above 1
-    return Calibration(
-        equal=scoring.reliability(stated, right),
-        adaptive=scoring.reliability(stated, right, scoring.adaptive_edges(stated)),
-        by_chance=scoring.calibrated_error(stated, rng),
-    )
+def _judged(
+    diagnoses: Iterable[Diagnosis | Record], name: str, cases: Sequence[IntervalCase] = ()
+) -> Scores:
+    """Return scores of diagnoses; at least one must carry its truth."""
+    scores = Scores.of(diagnoses, cases)
+    if not scores.runs:
+        raise InputError(
+            f"{name}: no run says what was true. Give a run set that does with --truth RUNS."
+        )
+    return scores
 
 
-def _cases(diagnosis: Diagnosis | Record, truth: RunTruth) -> list[scoring.IntervalCase]:
+def _cases(diagnosis: Diagnosis | Record, truth: RunTruth) -> list[IntervalCase]:
     """Return the intervals of a correctly diagnosed run with their true values."""
     hypothesis = Hypothesis.parse(str(diagnosis.diagnosis))
     mode = "+".join(f.mode for f in hypothesis.faults) or str(hypothesis)  # `unknown` has none
@@ -243,7 +188,7 @@ def _cases(diagnosis: Diagnosis | Record, truth: RunTruth) -> list[scoring.Inter
         ("magnitude", diagnosis.magnitude_90, truth.magnitude),
     )
     return [
-        scoring.IntervalCase(mode, quantity, *interval, true)
+        IntervalCase(mode, quantity, *interval, true)
         for quantity, interval, true in rows
         if interval is not None and np.isfinite(true)
     ]
@@ -267,8 +212,8 @@ class Comparison:
 
     first: str
     second: str
-    split: scoring.Split
-    gain: scoring.LogScoreGain
+    split: Split
+    gain: LogScoreGain
     as_unknown: tuple[int, int]
     runs: int
 
@@ -300,8 +245,8 @@ def compare(
     return Comparison(
         first=f"{one.name} (protocol {ours.protocol})",
         second=f"{other.name} (protocol {theirs.protocol})",
-        split=scoring.Split.of(ours.hits, theirs.hits),
-        gain=scoring.log_score_gain(ours.nats, theirs.nats, rng or np.random.default_rng(0)),
+        split=Split.of(ours.hits, theirs.hits),
+        gain=log_score_gain(ours.nats, theirs.nats, rng or np.random.default_rng(0)),
         as_unknown=(sum(ours.as_unknown.values()), sum(theirs.as_unknown.values())),
         runs=ours.runs,
     )

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.results import Record
@@ -38,179 +38,6 @@ class Share:
             return 0.0, 1.0
         low, high = binomtest(self.count, self.total).proportion_ci(method="wilson")
         return float(low), float(high)
-
-
-# Verdicts and probabilities.
-
-NO_VERDICT = "cannot tell"
-"""Class of the runs without a verdict."""
-UNKNOWN, HEALTHY = "unknown", "healthy"
-
-
-def judged_truth(truth: str, hypotheses: Container[str]) -> str:
-    """Return the correct answer for a run among these hypotheses.
-
-    It is `unknown` if the true fault is not among the hypotheses and `unknown` is; otherwise the
-    truth itself. A healthy robot is never `unknown`.
-    """
-    if truth == HEALTHY or truth in hypotheses or UNKNOWN not in hypotheses:
-        return truth
-    return UNKNOWN
-
-
-@dataclass(frozen=True)
-class Scores:
-    """Accuracy, confusion matrix and log score of the runs whose truth is known.
-
-    Attributes:
-        truth: Correct answer for each run; see `judged_truth`.
-        verdicts: Verdict on each run; None: no verdict.
-        posteriors: Probabilities of each run.
-        as_unknown: Number of runs whose correct answer is `unknown`, by true fault.
-        protocol: Protocol letters, joined by a slash.
-    """
-
-    truth: Sequence[str]
-    verdicts: Sequence[str | None]
-    posteriors: Sequence[Mapping[str, float]]
-    as_unknown: Mapping[str, int] = field(default_factory=dict)
-    protocol: str = ""
-
-    @classmethod
-    def of(cls, diagnoses: Iterable[Diagnosis | Record]) -> Scores:
-        """Return the scores of diagnoses by the truth that they carry; others are left out."""
-        given = list(diagnoses)
-        told = [(d, d.truth) for d in given if d.truth]
-        judged = [judged_truth(fault, d.posterior) for d, fault in told]
-        return cls(
-            truth=judged,
-            verdicts=[d.diagnosis for d, _ in told],
-            posteriors=[d.posterior for d, _ in told],
-            as_unknown=Counter(t for (_, t), true in zip(told, judged, strict=True) if t != true),
-            protocol="/".join(sorted({d.protocol or "?" for d in given})),
-        )
-
-    @property
-    def runs(self) -> int:
-        """Number of runs."""
-        return len(self.truth)
-
-    @property
-    def hits(self) -> BoolArray:
-        """Whether each run is diagnosed correctly, (run,)."""
-        pairs = zip(self.verdicts, self.truth, strict=True)
-        return np.array([verdict == true for verdict, true in pairs], dtype=np.bool_)
-
-    @property
-    def right(self) -> int:
-        """Number of correctly diagnosed runs."""
-        return int(self.hits.sum())
-
-    @property
-    def share(self) -> Share:
-        """Correctly diagnosed runs of all runs."""
-        return Share(self.right, self.runs)
-
-    @property
-    def accuracy(self) -> float:
-        """Share of correctly diagnosed runs."""
-        return self.share.value
-
-    @cached_property
-    def classes(self) -> tuple[str, ...]:
-        """Hypotheses, truths and verdicts, in the order of the confusion matrix."""
-        names = [name for posterior in self.posteriors for name in posterior]
-        return tuple(dict.fromkeys([*names, *self.truth, *self._named]))
-
-    @property
-    def _named(self) -> list[str]:
-        return [NO_VERDICT if verdict is None else verdict for verdict in self.verdicts]
-
-    @cached_property
-    def confusion(self) -> IntArray:
-        """Counts, (truth, diagnosis); None is a class of its own, `NO_VERDICT`."""
-        index = {name: i for i, name in enumerate(self.classes)}
-        cells = [[index[name] for name in names] for names in (self.truth, self._named)]
-        counts = np.zeros((len(index), len(index)), dtype=np.int64)
-        np.add.at(counts, tuple(cells), 1)
-        return counts
-
-    @property
-    def macro_f1(self) -> float:
-        """Mean F1 of the classes that are the truth of any run, equally weighted."""
-        true = self.confusion.sum(axis=1) > 0
-        return float(class_ratios(self.confusion)[true, 2].mean())
-
-    @cached_property
-    def nats(self) -> FloatArray:
-        """Log score of each run, (run,) [nats]; infinite where the truth has probability 0."""
-        return log_score(self.truth, self.posteriors)
-
-    @property
-    def log_score(self) -> float:
-        """Mean log score [nats per run]; may be infinite."""
-        return float(np.mean(self.nats))
-
-
-def class_ratios(confusion: IntArray) -> FloatArray:
-    """Return precision, recall and F1 of each class, (..., class, 3); 0 / 0 is NaN.
-
-    F1 = 2 hits / (runs + diagnoses). The confusion matrix holds counts (..., truth, diagnosis).
-    """
-    hits = np.diagonal(confusion, axis1=-2, axis2=-1)
-    runs, diagnoses = confusion.sum(axis=-1), confusion.sum(axis=-2)
-    with np.errstate(invalid="ignore"):
-        return np.stack([hits / diagnoses, hits / runs, 2 * hits / (runs + diagnoses)], axis=-1)
-
-
-def log_score(truth: Sequence[str], posterior: Sequence[Mapping[str, float]]) -> FloatArray:
-    """Return minus the log probability of the truth of each run [nats] (Good, JRSS B 1952).
-
-    It is infinite where the truth has probability 0 or is missing from the posterior.
-    """
-    chance = np.array([p.get(t, 0.0) for p, t in zip(posterior, truth, strict=True)])
-    with np.errstate(divide="ignore"):
-        return np.asarray(-np.log(chance) + 0.0)  # + 0.0 turns -0 into 0
-
-
-def brier_score(truth: Sequence[str], posterior: Sequence[Mapping[str, float]]) -> FloatArray:
-    """Return the Brier score of each run, sum over hypotheses of (probability - truth)^2.
-
-    0 is perfect, 2 is the worst (Brier, Monthly Weather Review 1950). A truth missing from its
-    posterior adds 1.
-    """
-    tables = [({t: 0.0, **p}, t) for p, t in zip(posterior, truth, strict=True)]
-    return np.array([sum((p - (name == t)) ** 2 for name, p in ps.items()) for ps, t in tables])
-
-
-@dataclass(frozen=True)
-class Alarms:
-    """False alarms and missed detections; an alarm is a verdict other than healthy.
-
-    Attributes:
-        false_alarms: Healthy runs with an alarm, of all healthy runs.
-        missed: Faulty runs without an alarm, of all faulty runs.
-        healthy_abstained: Healthy runs without a verdict.
-        faulty_abstained: Faulty runs without a verdict; included in `missed`.
-    """
-
-    false_alarms: Share
-    missed: Share
-    healthy_abstained: int
-    faulty_abstained: int
-
-    @classmethod
-    def of(cls, truth: Sequence[str], verdicts: Sequence[str | None]) -> Alarms:
-        """Count false alarms and missed detections; a verdict of None is none."""
-        healthy = np.array([true == HEALTHY for true in truth])
-        silent = np.array([verdict in (HEALTHY, None) for verdict in verdicts])
-        without = np.array([verdict is None for verdict in verdicts])
-        return cls(
-            false_alarms=Share(int((healthy & ~silent).sum()), int(healthy.sum())),
-            missed=Share(int((~healthy & silent).sum()), int((~healthy).sum())),
-            healthy_abstained=int((healthy & without).sum()),
-            faulty_abstained=int((~healthy & without).sum()),
-        )
 
 
 # Coverage of 90 % intervals.
@@ -260,6 +87,204 @@ def coverage_by_mode(cases: Iterable[IntervalCase]) -> list[Coverage]:
         inside = Share(len(group) - below - above, len(group))
         rows.append(Coverage(mode, quantity, inside, below, above, points))
     return rows
+
+
+# Verdicts and probabilities.
+
+NO_VERDICT = "cannot tell"
+"""Class of the runs without a verdict."""
+UNKNOWN, HEALTHY = "unknown", "healthy"
+
+
+def judged_truth(truth: str, hypotheses: Container[str]) -> str:
+    """Return the correct answer for a run among these hypotheses.
+
+    It is `unknown` if the true fault is not among the hypotheses and `unknown` is; otherwise the
+    truth itself. A healthy robot is never `unknown`.
+    """
+    if truth == HEALTHY or truth in hypotheses or UNKNOWN not in hypotheses:
+        return truth
+    return UNKNOWN
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of the diagnoses whose truth is known.
+
+    Attributes:
+        truth: Correct answer for each run; see `judged_truth`.
+        verdicts: Verdict on each run; None: no verdict.
+        posteriors: Probabilities of each run.
+        as_unknown: Number of runs whose correct answer is `unknown`, by true fault.
+        protocol: Protocol letters, joined by a slash.
+        cases: Intervals of the correctly diagnosed runs whose true values are known.
+    """
+
+    truth: Sequence[str]
+    verdicts: Sequence[str | None]
+    posteriors: Sequence[Mapping[str, float]]
+    as_unknown: Mapping[str, int] = field(default_factory=dict)
+    protocol: str = ""
+    cases: Sequence[IntervalCase] = ()
+
+    @classmethod
+    def of(
+        cls, diagnoses: Iterable[Diagnosis | Record], cases: Sequence[IntervalCase] = ()
+    ) -> Scores:
+        """Return the scores of diagnoses by the truth that they carry; others are left out."""
+        given = list(diagnoses)
+        told = [(d, d.truth) for d in given if d.truth]
+        judged = [judged_truth(fault, d.posterior) for d, fault in told]
+        return cls(
+            truth=judged,
+            verdicts=[d.diagnosis for d, _ in told],
+            posteriors=[d.posterior for d, _ in told],
+            as_unknown=Counter(t for (_, t), true in zip(told, judged, strict=True) if t != true),
+            protocol="/".join(sorted({d.protocol or "?" for d in given})),
+            cases=cases,
+        )
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return len(self.truth)
+
+    @property
+    def runs_and_protocol(self) -> str:
+        """Number of runs and protocol, as text."""
+        return f"{counted(self.runs, 'run')}, protocol {self.protocol}"
+
+    @property
+    def hits(self) -> BoolArray:
+        """Whether each run is diagnosed correctly, (run,)."""
+        pairs = zip(self.verdicts, self.truth, strict=True)
+        return np.array([verdict == true for verdict, true in pairs], dtype=np.bool_)
+
+    @property
+    def right(self) -> int:
+        """Number of correctly diagnosed runs."""
+        return int(self.hits.sum())
+
+    @property
+    def share(self) -> Share:
+        """Correctly diagnosed runs of all runs."""
+        return Share(self.right, self.runs)
+
+    @property
+    def accuracy(self) -> float:
+        """Share of correctly diagnosed runs."""
+        return self.share.value
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson 95 % interval of the accuracy."""
+        return self.share.interval
+
+    @property
+    def false_alarms(self) -> Share:
+        """Healthy runs with an alarm, a verdict other than healthy, of all healthy runs."""
+        verdicts = self._verdicts_on(healthy=True)
+        return Share(sum(v not in (HEALTHY, None) for v in verdicts), len(verdicts))
+
+    @property
+    def missed(self) -> Share:
+        """Faulty runs without an alarm, of all faulty runs."""
+        verdicts = self._verdicts_on(healthy=False)
+        return Share(sum(v in (HEALTHY, None) for v in verdicts), len(verdicts))
+
+    @property
+    def abstained(self) -> tuple[int, int]:
+        """Healthy and faulty runs without a verdict; the faulty ones count as missed."""
+        healthy, faulty = (self._verdicts_on(healthy).count(None) for healthy in (True, False))
+        return healthy, faulty
+
+    def _verdicts_on(self, healthy: bool) -> list[str | None]:
+        pairs = zip(self.verdicts, self.truth, strict=True)
+        return [verdict for verdict, true in pairs if (true == HEALTHY) == healthy]
+
+    @cached_property
+    def classes(self) -> tuple[str, ...]:
+        """Hypotheses, truths and verdicts, in the order of the confusion matrix."""
+        names = [name for posterior in self.posteriors for name in posterior]
+        return tuple(dict.fromkeys([*names, *self.truth, *self._named]))
+
+    @property
+    def _named(self) -> list[str]:
+        return [NO_VERDICT if verdict is None else verdict for verdict in self.verdicts]
+
+    @cached_property
+    def confusion(self) -> IntArray:
+        """Counts, (truth, diagnosis); no verdict is a class of its own, `NO_VERDICT`."""
+        index = {name: i for i, name in enumerate(self.classes)}
+        cells = [[index[name] for name in names] for names in (self.truth, self._named)]
+        counts = np.zeros((len(index), len(index)), dtype=np.int64)
+        np.add.at(counts, tuple(cells), 1)
+        return counts
+
+    @property
+    def macro_f1(self) -> float:
+        """Mean F1 of the classes that are the truth of any run, equally weighted."""
+        true = self.confusion.sum(axis=1) > 0
+        return float(class_ratios(self.confusion)[true, 2].mean())
+
+    @cached_property
+    def nats(self) -> FloatArray:
+        """Log score of each run, (run,) [nats]; infinite where the truth has probability 0."""
+        return log_score(self.truth, self.posteriors)
+
+    @property
+    def log_score(self) -> float:
+        """Mean log score [nats per run]; may be infinite."""
+        return float(np.mean(self.nats))
+
+    @property
+    def brier(self) -> float:
+        """Mean Brier score, 0 to 2."""
+        return float(brier_score(self.truth, self.posteriors).mean())
+
+    @cached_property
+    def decided(self) -> tuple[FloatArray, BoolArray]:
+        """Stated probability of each verdict, and whether it is right, (verdict,) each."""
+        rows = zip(self.verdicts, self.posteriors, self.hits, strict=True)
+        pairs = [(p[verdict], hit) for verdict, p, hit in rows if verdict is not None]
+        stated, right = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
+        return np.minimum(stated, 1.0), right > 0.0  # sums may round above 1
+
+    @property
+    def coverage(self) -> list[Coverage]:
+        """Coverage of 90 % intervals by fault mode; empty where true values are unknown."""
+        return coverage_by_mode(self.cases)
+
+
+def class_ratios(confusion: IntArray) -> FloatArray:
+    """Return precision, recall and F1 of each class, (..., class, 3); 0 / 0 is NaN.
+
+    F1 = 2 hits / (runs + diagnoses). The confusion matrix holds counts (..., truth, diagnosis).
+    """
+    hits = np.diagonal(confusion, axis1=-2, axis2=-1)
+    runs, diagnoses = confusion.sum(axis=-1), confusion.sum(axis=-2)
+    with np.errstate(invalid="ignore"):
+        return np.stack([hits / diagnoses, hits / runs, 2 * hits / (runs + diagnoses)], axis=-1)
+
+
+def log_score(truth: Sequence[str], posterior: Sequence[Mapping[str, float]]) -> FloatArray:
+    """Return minus the log probability of the truth of each run [nats] (Good, JRSS B 1952).
+
+    It is infinite where the truth has probability 0 or is missing from the posterior.
+    """
+    chance = np.array([p.get(t, 0.0) for p, t in zip(posterior, truth, strict=True)])
+    with np.errstate(divide="ignore"):
+        return np.asarray(-np.log(chance) + 0.0)  # + 0.0 turns -0 into 0
+
+
+def brier_score(truth: Sequence[str], posterior: Sequence[Mapping[str, float]]) -> FloatArray:
+    """Return the Brier score of each run, sum over hypotheses of (probability - truth)^2.
+
+    0 is perfect, 2 is the worst (Brier, Monthly Weather Review 1950). A truth missing from its
+    posterior adds 1.
+    """
+    tables = [({t: 0.0, **p}, t) for p, t in zip(posterior, truth, strict=True)]
+    return np.array([sum((p - (name == t)) ** 2 for name, p in ps.items()) for ps, t in tables])
 
 
 # Reliability and calibration error.
