@@ -43,6 +43,8 @@ from failuretwin.digital_model.robot import Robot, load_robot
 
 FORMAT = 1
 SUFFIX = ".npz"
+WEIGHT = "weight/"
+"""Prefix of the names of weights in a file."""
 _NOT_ARGUMENTS = ("encoder", "network")
 """Arguments of the estimator with their own place in the file."""
 Arrays = dict[str, NDArray[Any]]
@@ -69,7 +71,7 @@ def save_network(diagnoser: LearnedDiagnoser, path: str | Path) -> None:
         np.savez(file, allow_pickle=False, **arrays)
 
 
-def _arrays(diagnoser: LearnedDiagnoser, prefix: str = "weight/") -> Arrays:
+def _arrays(diagnoser: LearnedDiagnoser, prefix: str = WEIGHT) -> Arrays:
     """Return `mean`, `spread` and the weights of a network, these with a prefix."""
     standard, network = (part.state_dict() for part in diagnoser.network_)
     tensors = standard | {prefix + name: tensor for name, tensor in network.items()}
@@ -134,7 +136,11 @@ def _restored(
             f"{configuration['versions'].get('failuretwin')}."
         )
     encoder = _restored_encoder(configuration["encoder"], robot, path)
-    diagnoser = LearnedDiagnoser(configuration["network"], encoder, **configuration["arguments"])
+    arguments = configuration["arguments"]
+    known = set(LearnedDiagnoser().get_params(deep=False)) - set(_NOT_ARGUMENTS)
+    if set(arguments) != known:
+        raise KeyError(f"arguments {sorted(set(arguments) ^ known)}")
+    diagnoser = LearnedDiagnoser(configuration["network"], encoder, **arguments)
     diagnoser.classes_ = np.array(configuration["classes"])
     diagnoser.temperature_ = float(configuration["temperature"])
     diagnoser.n_features_in_ = configuration["features_in"]
@@ -143,7 +149,8 @@ def _restored(
     diagnoser.weights_ = pool and from_table(PoolWeights, pool, f"{path}: weights")
     standard = Standard(arrays.pop("mean"), arrays.pop("spread"))
     diagnoser.network_ = diagnoser.untrained(standard, len(diagnoser.classes_))
-    weights = {n.removeprefix("weight/"): torch.from_numpy(a) for n, a in arrays.items()}
+    named = [name for name in arrays if name.startswith(WEIGHT)]
+    weights = {name.removeprefix(WEIGHT): torch.from_numpy(arrays[name]) for name in named}
     diagnoser.network_[1].load_state_dict(weights)
     _check_numbers(diagnoser)
     return diagnoser
