@@ -34,6 +34,7 @@ from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior, compute_posterior
 from failuretwin.inference.set_ups.setup_prior import SetupPrior
+from failuretwin.inference.theta.shared_unknowns import layout_of as offsets_in_doubt
 
 COARSE_TO_FINE = (0.026, 0.004, 0.0)
 """Noise added while a displaced sensor is registered, as shares of the reach."""
@@ -196,7 +197,11 @@ def sensor_in_doubt(
         return False
     settled = replace(likelihood, moving=None)
     told = [*ranked, *(h for h in hypotheses if len(h.faults) > 1)]
-    best = np.argmax(compute_posterior(settled, told, priors).log_posterior, axis=1)
+    if offsets_in_doubt(settled.model).offsets:
+        found = robot_posterior(settled, told, priors).log_posterior
+    else:
+        found = compute_posterior(settled, told, priors).log_posterior
+    best = np.argmax(found, axis=1)
     single = np.flatnonzero(best < len(ranked))
     return bool(len(single)) and _suspect(settled[single], ranked, priors, best[single])
 
@@ -216,8 +221,13 @@ def _suspect(
         information[rows], shift[rows] = theta_factors(some.evidence)
         ill[rows] = misfit_of(some.evidence) > ILL_FITTING
     frames = displaced_components(likelihood.model, priors.setup, layout, usual)
-    covariance = np.maximum.reduce(frames.covariance)
-    step = _newton(information.sum(axis=0), shift.sum(axis=0), np.zeros(size), covariance)
+    own, rest = slice(None, REGISTRATION), slice(REGISTRATION, None)
+    known = np.linalg.inv(usual.covariance[0])[rest, rest]  # each run has offsets of its own
+    left = np.linalg.solve(information[:, rest, rest] + known, information[:, rest, own])
+    shift = shift[:, own] - np.einsum("rtu,rt->ru", left, shift[:, rest])
+    information = information[:, own, own] - information[:, own, rest] @ left
+    broad = np.linalg.inv(np.maximum.reduce(frames.covariance)[own, own])
+    step = np.linalg.solve(information.sum(axis=0) + broad, shift.sum(axis=0))
     gain = 0.5 * float(shift.sum(axis=0) @ step)
     of_run = shift @ step - 0.5 * np.einsum("t,rtu,u->r", step, information, step)
     together = gain > SUSPECT_NATS and float(np.median(of_run)) > SUSPECT_RUN_NATS
