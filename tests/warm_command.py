@@ -29,6 +29,8 @@ WARM = (
         "failuretwin.connection.tracked_diagnosis",
     ),
     *("failuretwin.app.reports.calibration_report", "failuretwin.data_knowledge.generate"),
+    *("failuretwin.app.arms", "failuretwin.app.live", "failuretwin.decision.test_motions.session"),
+    *("dask.array", "matplotlib.backends.backend_agg", "mujoco", "zarr"),
 )
 LIMIT_S = 120.0
 DISK_BYTES = 500

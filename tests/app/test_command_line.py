@@ -190,11 +190,11 @@ def test_wrong_diagnoses_are_marked(failuretwin, simulated, tmp_path):
 
 
 def test_a_fault_that_is_not_named_is_rightly_called_unknown(failuretwin, simulated, tmp_path):
-    save_run_set(load_run_set(simulated).isel(run=[0, 2]), tmp_path / "two.nc")
-    arguments = ("two.nc", "--hypotheses", "healthy,motor_1:stuck,unknown", "--report", "page")
+    save_run_set(load_run_set(simulated).isel(run=[2]), tmp_path / "one.nc")
+    arguments = ("one.nc", "--hypotheses", "healthy,motor_1:stuck,unknown", "--report", "page")
     answer = failuretwin("diagnose", *arguments, folder=tmp_path)
     assert "WRONG" not in answer.stdout
-    assert "2 of 2 runs right" in answer.stdout
+    assert re.search("1 of 1 runs? right", answer.stdout)
     line = "judged as unknown, since not among the hypotheses: motor_2:stuck (1 run)"
     assert line in answer.stdout.splitlines()
     page = (tmp_path / "page" / "index.html").read_text()
@@ -203,7 +203,8 @@ def test_a_fault_that_is_not_named_is_rightly_called_unknown(failuretwin, simula
 
 
 def test_without_truth_there_is_nothing_to_score(failuretwin, simulated, tmp_path):
-    save_run_set(load_run_set(simulated).drop_vars("fault"), tmp_path / "runs.nc")
+    runs = load_run_set(simulated).isel(run=[0, 2])
+    save_run_set(runs.drop_vars("fault"), tmp_path / "runs.nc")
     answer = failuretwin("diagnose", "runs.nc", folder=tmp_path)
     assert answer.returncode == 0
     for word in ("right", "WRONG", "accuracy", "confusion"):
@@ -233,12 +234,15 @@ def test_imported_sessions_give_the_same_results(failuretwin, write_session, tmp
     write_session(tmp_path / "logs" / "20240101_label_0", seed=1)
     write_session(tmp_path / "logs" / "20240102_label_3", seed=2)
     options = ["--as", how, "--published-labels"]
+    among = ["--hypotheses", "healthy,motor_3:stuck,motor_3:steady_state_error"]
     runs = f"runs{suffix}"
 
     imported = failuretwin("import", "logs", "--out", runs, *options, folder=tmp_path)
     assert imported.stdout == f"2 runs written to {runs}\n"
-    stored = failuretwin("diagnose", runs, "--json", "stored.jsonl", folder=tmp_path)
-    direct = failuretwin("diagnose", "logs", *options, "--json", "direct.jsonl", folder=tmp_path)
+    stored = failuretwin("diagnose", runs, *among, "--json", "stored.jsonl", folder=tmp_path)
+    direct = failuretwin(
+        "diagnose", "logs", *options, *among, "--json", "direct.jsonl", folder=tmp_path
+    )
 
     assert stored.returncode == direct.returncode == 0, stored.stderr + direct.stderr
     records = read_lines(tmp_path / "direct.jsonl")
@@ -253,31 +257,21 @@ def test_faults_come_as_large_as_the_file_says(failuretwin, tmp_path):
     (tmp_path / "faults.toml").write_text("[drift]\nmagnitude = [0.02, 0.02]\nonset_s = [3, 3]\n")
     answer = failuretwin(
         *("simulate", "--out", "x.nc", "--runs-per-class", 2, "--faults", "faults.toml"),
-        *("--hypotheses", "motor_1:stuck,motor_2:drift"),
+        *("--hypotheses", "motor_1:stuck,motor_2:drift", "--seed", 3),
         folder=tmp_path,
     )
     assert answer.returncode == 0, answer.stderr
     runs = load_run_set(tmp_path / "x.nc")
+    assert runs.attrs["seed"] == 3
     np.testing.assert_allclose(runs["onset"], [0.49, 0.49, 3.0, 3.0])
     np.testing.assert_allclose(np.abs(runs["magnitude"][2:]), 0.02)
     modes = json.loads(runs.attrs["configuration"])["modes"]
     assert modes["drift"]["magnitude"] == [0.02, 0.02]
 
 
-def test_simulated_runs_do_not_depend_on_the_workers(failuretwin, tmp_path):
-    for workers in (1, 2):
-        failuretwin(
-            *("simulate", "--out", f"{workers}.nc", "--runs-per-class", 60, "--workers", workers),
-            *("--hypotheses", "healthy, motor_2:stuck", "--seed", 3),
-            folder=tmp_path,
-        )
-    one, two = (load_run_set(tmp_path / f"{n}.nc") for n in (1, 2))
-    assert one.sizes["run"] == 120
-    assert one.identical(two)
-    assert one.attrs["seed"] == 3
-
-
-def test_a_picture_for_every_run(failuretwin, simulated, tmp_path):
+def test_a_picture_for_every_run_and_a_page_that_says_what_the_screen_says(
+    failuretwin, simulated, tmp_path
+):
     runs = load_run_set(simulated).isel(run=[0, 1, 5])
     names = ["a/b", "a b", "c"]
     save_run_set(runs.assign_coords(run=names), tmp_path / "runs.nc")
@@ -289,14 +283,7 @@ def test_a_picture_for_every_run(failuretwin, simulated, tmp_path):
         assert picture.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
         assert picture.stat().st_size > 10_000
     assert list(tmp_path.rglob("*partial*")) == []
-
-
-def test_the_page_and_the_screen_say_the_same_of_all_runs(failuretwin, simulated, tmp_path):
-    runs = load_run_set(simulated).isel(run=[0, 2])
-    save_run_set(runs, tmp_path / "runs.nc")
-    answer = failuretwin("diagnose", "runs.nc", "--report", "page", folder=tmp_path)
-    assert answer.returncode == 0, answer.stderr
-    page = (tmp_path / "page" / "index.html").read_text("utf-8")
+    page = (tmp_path / "x" / "pictures" / "index.html").read_text("utf-8")
     (step,) = re.findall(r"^what to do: (.*)$", answer.stdout, re.M)
     (line,) = re.findall(r"^over all runs: (.*)$", answer.stdout, re.M)
     assert f"<b>Next step:</b> {step}</p>" in page
@@ -314,6 +301,7 @@ def test_without_a_terminal_there_is_neither_colour_nor_progress(results):
 def test_output_may_be_cut_off_by_the_next_command(simulated):
     """As in `failuretwin diagnose RUNS | head -1`."""
     command = [sys.executable, "-u", "-m", "failuretwin", "diagnose", str(simulated)]
+    command += ["--hypotheses", "healthy"]
     read, write = os.pipe()
     os.close(read)
     try:

@@ -106,28 +106,36 @@ def test_an_interrupt_ends_the_workers_and_leaves_no_netcdf(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+FEW = ("--hypotheses", "healthy,motor_1:stuck")
+
+
+@pytest.fixture(scope="module")
+def one_run(failuretwin, tmp_path_factory):
+    """A healthy run without imperfections."""
+    path = tmp_path_factory.mktemp("one_run") / "runs.nc"
+    run = ["--hypotheses", "healthy", "--runs-per-class", 1, "--seed", 3, "--out", path]
+    assert failuretwin("simulate", *run).returncode == 0
+    return path
+
+
 @pytest.mark.parametrize("said", ["not JSON", "[1, 2]", '{"imperfections": 3}'])
-def test_a_configuration_of_other_people_does_no_harm(failuretwin, tmp_path, said):
-    run = ["--hypotheses", "healthy", "--runs-per-class", "1", "--out", "runs.nc"]
-    failuretwin("simulate", *run, folder=tmp_path)
-    with xr.open_dataset(tmp_path / "runs.nc", engine="h5netcdf") as stored:
+def test_a_configuration_of_other_people_does_no_harm(failuretwin, one_run, tmp_path, said):
+    with xr.open_dataset(one_run, engine="h5netcdf") as stored:
         runs = stored.load()
     runs.attrs["configuration"] = said
     runs.to_netcdf(tmp_path / "theirs.nc", engine="h5netcdf")
 
-    result = failuretwin("diagnose", "theirs.nc", folder=tmp_path)
+    result = failuretwin("diagnose", "theirs.nc", *FEW, folder=tmp_path)
 
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
 
 
-def test_paths_that_no_whole_counts_make_need_approximate(failuretwin, tmp_path):
-    run = ["--hypotheses", "healthy", "--runs-per-class", "1", "--seed", "3", "--out"]
-    failuretwin("simulate", *run, "runs.nc", folder=tmp_path)
-    failuretwin("import", "runs.nc", "--out", "runs.mat", folder=tmp_path)
+def test_paths_that_no_whole_counts_make_need_approximate(failuretwin, one_run, tmp_path):
+    failuretwin("import", one_run, "--out", "runs.mat", folder=tmp_path)
 
     exact = failuretwin("diagnose", "runs.mat", folder=tmp_path)
-    fitted = failuretwin("diagnose", "runs.mat", "--approximate", folder=tmp_path)
+    fitted = failuretwin("diagnose", "runs.mat", "--approximate", *FEW, folder=tmp_path)
 
     assert exact.returncode == 2
     assert "--approximate" in exact.stderr

@@ -27,7 +27,7 @@ def network(tmp_path_factory):
     """A network that has seen four batches, and what training it printed."""
     path = tmp_path_factory.mktemp("network") / "network.npz"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "TrainingPlan", partial(training.TrainingPlan, validation_runs=36))
+        patch.setattr(training, "TrainingPlan", partial(training.TrainingPlan, validation_runs=18))
         answer = run("train", "--out", path, "--iterations", 4, "--seed", 3)
     return path, answer.output
 
@@ -35,7 +35,7 @@ def network(tmp_path_factory):
 def test_a_trained_network_is_calibrated_on_the_other_engine(network, armpi):
     path, told = network
     loaded = load_network(path, armpi)
-    assert "18 simulated runs of the physics engine" in told
+    assert "9 simulated runs of the physics engine" in told
     assert "blended with Bayes" in told
     assert loaded.weights_.bayes > loaded.weights_.network  # it has seen four batches
     assert f"temperature {loaded.temperature_:.2f}" in told

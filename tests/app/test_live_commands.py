@@ -25,6 +25,17 @@ def told(answer):
 
 
 @pytest.fixture(scope="module")
+def watched(failuretwin, tmp_path_factory):
+    """What was said of the same robot while it was recorded, and the recording."""
+    path = tmp_path_factory.mktemp("watched") / "live.mcap"
+    answer = failuretwin(
+        *("watch", "emulated", "--speed", 0, "--seconds", 45, "--record", path), *FAULT
+    )
+    assert answer.returncode == 0, answer.stderr
+    return answer, path
+
+
+@pytest.fixture(scope="module")
 def recording(failuretwin, tmp_path_factory):
     """An emulated robot of which motor 3 sticks from 12 to 25 s, as a file."""
     path = tmp_path_factory.mktemp("live") / "robot.mcap"
@@ -43,11 +54,17 @@ def check_found(changes):
     assert [text.startswith("healthy again") for at, text in changes if at > 25.0][-1]
 
 
-def test_a_recorded_fault_and_its_repair_are_found(failuretwin, recording):
-    answer = failuretwin("watch", recording, "--speed", 0)
+def test_an_emulated_robot_is_watched(watched):
+    check_found(told(watched[0]))
+
+
+def test_a_recorded_fault_and_its_repair_are_found(failuretwin, watched):
+    live, path = watched
+    answer = failuretwin("watch", path, "--speed", 0)
     assert answer.returncode == 0, answer.stderr
     check_found(told(answer))
     assert "last answer: healthy" in answer.stdout
+    assert [text for _, text in told(answer)][-1:] == [text for _, text in told(live)][-1:]
 
 
 def test_a_written_life_goes_on_after_its_last_fault(failuretwin, tmp_path):
@@ -55,17 +72,6 @@ def test_a_written_life_goes_on_after_its_last_fault(failuretwin, tmp_path):
     answer = failuretwin("emulate", "--to", path, "--fault", "motor_3:stuck@40-65")
     assert [text for _, text in told(answer)] == ["healthy", "motor_3:stuck", "healthy"]
     assert f"85 s written to {path}" in answer.stdout
-
-
-def test_an_emulated_robot_is_watched_and_recorded(failuretwin, tmp_path):
-    path = tmp_path / "live.mcap"
-    answer = failuretwin(
-        *("watch", "emulated", "--speed", 0, "--seconds", 45, "--record", path), *FAULT
-    )
-    assert answer.returncode == 0, answer.stderr
-    check_found(told(answer))
-    again = failuretwin("watch", path, "--speed", 0)
-    assert [text for _, text in told(again)][-1:] == [text for _, text in told(answer)][-1:]
 
 
 def test_an_emulated_robot_has_a_fault_of_a_size_that_begins_at_a_time(failuretwin):

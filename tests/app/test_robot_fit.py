@@ -9,9 +9,10 @@ import pytest
 from failuretwin import Plan, load_robot, simulate
 from failuretwin.app.cli import main
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.data_knowledge.store import save_run_set
+from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.digital_model.profile_text import fitted_text
 
+FEW = ("--hypotheses", "healthy,motor_1:stuck,motor_2:steady_state_error")
 BASE = (0.4, -0.3, 0.2, 0.1, -0.2, 2.5)
 
 
@@ -54,7 +55,7 @@ def test_fit_writes_a_profile_that_puts_the_tool_where_it_is_seen(run, tracked, 
     made = load_robot(out)
     np.testing.assert_allclose(made.profile.base_xyz_rpy, BASE, atol=2e-3)
     assert "failuretwin robot fit on 20" in made.profile.geometry.source
-    assert run("diagnose", tracked, "--robot", out)[0] == 0
+    assert run("diagnose", tracked, "--robot", out, *FEW)[0] == 0
 
 
 def test_fit_overwrites_no_other_file(run, tracked, tmp_path):
@@ -66,7 +67,9 @@ def test_fit_overwrites_no_other_file(run, tracked, tmp_path):
 
 
 def test_diagnose_names_the_frame_that_nobody_told(run, tracked):
-    code, said, _ = run("diagnose", tracked, "--robot", "ur5e")
+    few = tracked.with_name("few.nc")
+    save_run_set(load_run_set(tracked).isel(run=slice(0, 3)), few)
+    code, said, _ = run("diagnose", few, "--robot", "ur5e", *FEW)
     assert code == 0
     assert "in a frame turned by" in said
     assert "failuretwin robot fit" in said

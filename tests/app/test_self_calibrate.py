@@ -14,7 +14,7 @@ from calibration_files import read_calibration
 from failuretwin.app.cli import cli
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.store import save_run_set
+from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.settling import Settling
@@ -43,10 +43,19 @@ def records(path):
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_runs_are_judged_together_and_the_robot_is_kept(runs, armpi, tmp_path):
-    out, file = tmp_path / "own.toml", tmp_path / "out.jsonl"
-    answer = diagnose(runs, "--self-calibrate", "--out", out, "--json", file)
-    found = records(file)
+@pytest.fixture(scope="module")
+def together(runs, tmp_path_factory):
+    """What is said and written of the runs when they are judged together."""
+    folder = tmp_path_factory.mktemp("together")
+    written = ("--out", folder / "own.toml", "--json", folder / "out.jsonl")
+    tables = ("--csv", folder / "out.csv", "--report", folder / "page")
+    return diagnose(runs, "--self-calibrate", *written, *tables), folder
+
+
+def test_runs_are_judged_together_and_the_robot_is_kept(together, runs, armpi, tmp_path):
+    answer, folder = together
+    out, file = folder / "own.toml", tmp_path / "out.jsonl"
+    found = records(folder / "out.jsonl")
     assert [r["diagnosis"] for r in found] == [name for name in TRUTHS for _ in range(2)]
     assert {r["protocol"] for r in found} == {"P1"}
     learned = read_calibration(out, armpi)
@@ -56,20 +65,19 @@ def test_runs_are_judged_together_and_the_robot_is_kept(runs, armpi, tmp_path):
     assert [line.removeprefix("self-calibrated: ") for line in told] == list(learned.remarks)
     assert "6 of 6 runs right" in answer.output
     # The file is a calibration like any other, and may be learned from again.
-    diagnose(runs, "--self-calibrate", "--calibration", out, "--json", file)
+    names = ",".join(TRUTHS)
+    diagnose(runs, "--self-calibrate", "--calibration", out, "--json", file, "--hypotheses", names)
     assert {r["protocol"] for r in records(file)} == {"P1"}
 
 
-def test_the_page_tells_what_was_learned_of_the_robot(runs, armpi, tmp_path):
+def test_the_page_tells_what_was_learned_of_the_robot(together, armpi):
     """Sentences, every offset beside such robots, every run; the motor that is off stands out."""
-    diagnose(
-        runs, "--self-calibrate", "--report", tmp_path / "page", "--out", tmp_path / "own.toml"
-    )
-    page = (tmp_path / "page" / "index.html").read_text()
+    _, folder = together
+    page = (folder / "page" / "index.html").read_text()
     section = page[page.index("What the runs taught") : page.index("<h2>Runs</h2>")]
     rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in section.split("<tr>")]
     of_bias = {row[0]: row for row in rows if row and row[0].startswith("bias")}
-    learned = read_calibration(tmp_path / "own.toml", armpi)
+    learned = read_calibration(folder / "own.toml", armpi)
     for p in learned.parameters:
         spread = generic_imperfections(armpi).variation.bias[0]
         if p.name == "bias":
@@ -83,17 +91,28 @@ def test_the_page_tells_what_was_learned_of_the_robot(runs, armpi, tmp_path):
     assert section.count("<li>") == len(learned.remarks)
 
 
-@pytest.mark.parametrize("option", ["--self-calibrate", "--track"])
-def test_what_all_runs_say_of_each_is_written_too(runs, tmp_path, option):
-    file, table, alone = tmp_path / "out.jsonl", tmp_path / "out.csv", tmp_path / "alone.jsonl"
-    answer = diagnose(runs, option, "--json", file, "--csv", table)
+@pytest.fixture(scope="module")
+def tracked(runs, tmp_path_factory):
+    """The same when each is judged by those before it."""
+    folder = tmp_path_factory.mktemp("tracked")
+    tables = ("--json", folder / "out.jsonl", "--csv", folder / "out.csv")
+    return diagnose(runs, "--track", *tables), folder
+
+
+@pytest.mark.parametrize("way", ["together", "tracked"])
+def test_what_all_runs_say_of_each_is_written_too(request, runs, tmp_path, way):
+    answer, folder = request.getfixturevalue(way)
+    file, table, alone = folder / "out.jsonl", folder / "out.csv", tmp_path / "alone.jsonl"
+    option = {"together": "--self-calibrate", "tracked": "--track"}[way]
     told, (header, *cells) = records(file), csv.reader(table.read_text().splitlines())
     assert "over all runs: " in answer.output
     assert all(0.0 < r["course_probability"] <= 1.0 for r in told)
     assert [row[header.index("course")] for row in cells] == [r["course"] for r in told]
     assert {r["course"] for r in told} <= {*told[0]["posterior"]}
-    diagnose(runs, option, "--independent", "--json", alone)
+    names = ",".join(TRUTHS)
+    diagnose(runs, option, "--independent", "--json", alone, "--hypotheses", names)
     assert not any("course" in r for r in records(alone))
+    assert all(list(r["posterior"]) == TRUTHS for r in records(alone))
 
 
 def test_runs_of_two_robots_are_noticed_on_the_way(armpi, tmp_path):
@@ -109,13 +128,6 @@ def test_runs_of_two_robots_are_noticed_on_the_way(armpi, tmp_path):
     assert "two robots" not in one.output
     both = diagnose(tmp_path / "a.nc", tmp_path / "b.nc", "--track")
     assert "the runs seem to be of two robots" in both.output
-
-
-def test_hypotheses_count(runs, tmp_path):
-    file = tmp_path / "out.jsonl"
-    names = ",".join(TRUTHS)
-    diagnose(runs, "--self-calibrate", "--hypotheses", names, "--json", file)
-    assert all(list(r["posterior"]) == TRUTHS for r in records(file))
 
 
 def test_without_it_nothing_is_learned(runs, tmp_path):
@@ -157,10 +169,13 @@ def test_runs_without_a_tool_position_are_refused(armpi, tmp_path, option):
 
 
 def test_errors_that_were_ruled_out_are_told(runs, armpi, tmp_path):
-    narrow = diagnose(runs, "--error-range", "0.01", "0.02", "deg")
+    few = tmp_path / "few.nc"
+    save_run_set(load_run_set(runs).isel(run=[0, 4]), few)
+    among = (few, "--hypotheses", "healthy,motor_3:steady_state_error", "--error-range")
+    narrow = diagnose(*among, "0.01", "0.02", "deg")
     assert "would look otherwise without the range of errors that was given" in narrow.stderr
     assert "motor 3 misses its targets" in narrow.stderr
-    assert "look otherwise" not in diagnose(runs, "--error-range", "2", "15", "deg").stderr
+    assert "look otherwise" not in diagnose(*among, "2", "15", "deg").stderr
 
 
 def test_a_network_cannot_be_told_to(runs, tmp_path, monkeypatch):

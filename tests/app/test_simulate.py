@@ -13,7 +13,7 @@ import pytest
 from failuretwin.data_knowledge.store import load_run_set
 from waiting import WAIT_S
 
-COMMAND = ("simulate", "--runs-per-class", 40, "--calibration", "armpi_fpv", "--out")
+COMMAND = ("simulate", "--runs-per-class", 30, "--calibration", "armpi_fpv", "--out")
 
 
 def remarks(stderr):
@@ -28,11 +28,11 @@ def contents(folder):
 
 @pytest.fixture(scope="module")
 def made_by_one(failuretwin, tmp_path_factory):
-    """A run set in four pieces, made by one process."""
+    """A run set in three pieces, made by one process."""
     path = tmp_path_factory.mktemp("one") / "runs.zarr"
     answer = failuretwin(*COMMAND, path)
     assert (answer.returncode, remarks(answer.stderr)) == (0, "")
-    assert answer.stdout == f"360 runs written to {path}\n"
+    assert answer.stdout == f"270 runs written to {path}\n"
     return path
 
 
@@ -44,7 +44,7 @@ def test_two_workers_write_the_same_bytes(failuretwin, tmp_path, made_by_one):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_interrupted_work_is_kept_and_continued(failuretwin, tmp_path, workers):
-    arguments = [*COMMAND, tmp_path / "runs.zarr", "--runs-per-class", 100]
+    arguments = [*COMMAND, tmp_path / "runs.zarr", "--runs-per-class", 60]
     words = [*arguments, "--workers", workers]
     command = [sys.executable, "-m", "failuretwin", *map(str, words)]
     with subprocess.Popen(
@@ -58,13 +58,13 @@ def test_interrupted_work_is_kept_and_continued(failuretwin, tmp_path, workers):
         os.killpg(process.pid, signal.SIGINT)
         assert process.wait(WAIT_S) == 1
         told, _, rest = remarks(process.stderr.read()).partition("\n")
-    assert "of 900 runs are kept in" in told
+    assert "of 540 runs are kept in" in told
     assert rest.split() == ["interrupted"]
     kept = told.split()[0]
     assert not (tmp_path / "runs.zarr").exists()
     again = failuretwin(*arguments)
-    assert remarks(again.stderr) == f"continuing: {kept} of 900 runs were there\n"
-    assert load_run_set(tmp_path / "runs.zarr").sizes["run"] == 900
+    assert remarks(again.stderr) == f"continuing: {kept} of 540 runs were there\n"
+    assert load_run_set(tmp_path / "runs.zarr").sizes["run"] == 540
     assert [path.name for path in tmp_path.iterdir()] == ["runs.zarr"]
 
 

@@ -65,7 +65,7 @@ def test_without_a_sound_step_there_is_a_reason(tmp_path, armpi):
 
 
 def test_a_calibration_with_step_tests(tmp_path, write_tests, write_session, failuretwin):
-    for seed in range(3):
+    for seed in range(2):
         write_session(tmp_path / "logs" / f"s{seed}", seed=seed)
     write_tests(tmp_path / "tests", [6, 5, 4, 3])
     out = tmp_path / "own.toml"

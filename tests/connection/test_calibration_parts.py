@@ -312,7 +312,7 @@ def test_settling_of_a_known_robot_comes_back(settle, armpi, readings, shares):
     assert 3.0 < found.tail_dof < 9.0
 
 
-@pytest.mark.parametrize(("readings", "draws"), [(True, 12), (False, 6)])
+@pytest.mark.parametrize(("readings", "draws"), [(True, 8), (False, 6)])
 def test_settling_intervals_hold_the_truth(settle, armpi, readings, draws):
     inside = []
     for seed in range(draws):
@@ -443,7 +443,7 @@ def test_motors_that_do_not_give_way_do_not_tell_their_sense(settle, armpi):
     """Runs of a simulation without imperfections: nothing sags, either way."""
     ideal = replace(TYPICAL, bias=(0.0,) * 4, compliance=(0.0,) * 4, friction=(0.0,) * 4)
     for scatter in (1e-6, 2e-3):
-        seen = settle(replace(ideal, scatter=(scatter,) * 4), seed=9, movements=60)
+        seen = settle(replace(ideal, scatter=(scatter,) * 4), seed=9, movements=30)
         for remark in sense_remarks(fit_settling(seen), armpi):
             assert "check it" not in remark
             assert "as in the profile" not in remark
@@ -478,7 +478,7 @@ def test_no_payload_is_told_where_there_is_none(settle, armpi):
 
 def test_a_heavy_payload_on_a_precise_arm_is_told(settle, armpi):
     loaded = replace(TYPICAL, compliance=(0.0, 0.05, 0.05, 0.05), scatter=(3e-4,) * 4, payload=0.5)
-    seen = settle(loaded, seed=10, movements=300, readings=False)
+    seen = settle(loaded, seed=10, movements=200, readings=False)
     payload, told = best_payload(fit_settling(seen), armpi)
     assert payload == 0.5
     assert "about 0.5 kg at the tool point" in told

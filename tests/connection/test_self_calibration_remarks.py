@@ -16,7 +16,7 @@ from failuretwin.failure_behavior.random_movements import RandomMovements
 @pytest.fixture(scope="module")
 def runs():
     return ft.simulate(
-        ft.Plan("armpi_fpv", ["healthy", "motor_2:stuck"], 8, seed=11, imperfections="armpi_fpv")
+        ft.Plan("armpi_fpv", ["healthy", "motor_2:stuck"], 5, seed=11, imperfections="armpi_fpv")
     )
 
 

@@ -66,7 +66,9 @@ def test_the_same_runs_get_the_same_diagnoses(cells, data, armpi, twin):
     raw = read_runs(data / "real_robot_b_20241003", armpi, ReadOptions("published", True))
     diagnoser = BayesDiagnoser(twin)
 
-    from_cells, from_logs = diagnoser.diagnose(cells), diagnoser.diagnose(raw)
+    from_cells, from_logs = (
+        diagnoser.diagnose(runs.isel(run=slice(None, None, 3))) for runs in (cells, raw)
+    )
 
     assert [d.truth for d in from_cells] == [d.truth for d in from_logs]
     assert [d.diagnosis for d in from_cells] == [d.diagnosis for d in from_logs]

@@ -210,13 +210,13 @@ def test_faults_above_the_smallest_size_are_found_and_those_well_below_are_not(
         for name, size in smallest.items():
             low = 0.9 * factor * size
             modes = {**MODES, "steady_state_error": SteadyStateError(magnitude=(low, low / 0.81))}
-            plan = Plan(armpi, faults(name)[1:], 12, 4, measured_armpi, modes=modes)
+            plan = Plan(armpi, faults(name)[1:], 6, 4, measured_armpi, modes=modes)
             found = diagnoser.diagnose(simulate(plan))
             right[factor, name] = sum(d.diagnosis == d.truth for d in found)
     above = [count for (factor, _), count in right.items() if factor > 1]
     below = [count for (factor, _), count in right.items() if factor < 1]
-    assert sum(above) >= 0.9 * 48
-    assert sum(below) <= 0.2 * 48
+    assert sum(above) >= 0.9 * 24
+    assert sum(below) <= 0.2 * 24
 
 
 def test_stuck_motors_of_real_motions_are_told_apart(twin, armpi, measured_armpi, real_motions):

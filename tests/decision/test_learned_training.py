@@ -172,7 +172,7 @@ def test_widened_robots_differ_more(armpi):
 
 
 def test_a_network_is_trained_and_pooled_with_bayes_in_one_call(armpi, measured_armpi):
-    plan = TrainingPlan(iterations=2, validation_runs=36)
+    plan = TrainingPlan(iterations=2, validation_runs=18)
     both = train(armpi, measured_armpi, plan, with_bayes=True)
     assert isinstance(both, HybridDiagnoser)
     assert both.weights == both.network.weights_

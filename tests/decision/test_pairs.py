@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin import BayesDiagnoser
+from failuretwin import BayesDiagnoser, SetupPrior
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -26,6 +26,7 @@ SINGLES = tuple(
     Hypothesis((fault,)) for fault in sorted({f for p in PAIRS for f in p.faults}, key=str)
 )
 RUNS = 2
+KNOWN_SET_UP = Priors(setup=SetupPrior.known())
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,8 @@ def runs(armpi):
 
 @pytest.fixture(scope="module")
 def found(twin, runs):
-    return BayesDiagnoser(twin, hypotheses=(HEALTHY, *SINGLES, *PAIRS)).diagnose(runs)
+    hypotheses = (HEALTHY, *SINGLES, *PAIRS)
+    return BayesDiagnoser(twin, hypotheses=hypotheses, priors=KNOWN_SET_UP).diagnose(runs)
 
 
 def test_two_faults_at_once_are_found(found):
@@ -64,7 +66,8 @@ def test_a_single_fault_is_not_taken_for_two(twin, imperfect, found):
     alone = tuple(
         Hypothesis.parse(f"motor_{k}:{m}") for m in ("stuck", "steady_state_error") for k in (1, 3)
     )
-    told = BayesDiagnoser(twin, hypotheses=(HEALTHY, *alone, *both)).diagnose(
+    hypotheses = (HEALTHY, *alone, *both)
+    told = BayesDiagnoser(twin, hypotheses=hypotheses, priors=KNOWN_SET_UP).diagnose(
         imperfect.isel(run=rows)
     )
     assert all("+" not in (d.diagnosis or "") for d in told)

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from failuretwin import BayesDiagnoser
+from failuretwin import BayesDiagnoser, Priors, SetupPrior
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -19,6 +19,7 @@ from failuretwin.failure_behavior.registry import MODES
 
 RUNS = 12
 """Runs for each motor."""
+KNOWN_SET_UP = Priors(setup=SetupPrior.known())
 LEAST_COVER = 0.85
 """What intervals of 90 % must cover, by a test that fails one in a thousand of such."""
 COVERED = {
@@ -110,8 +111,8 @@ def study_of(mode, twin, armpi, imperfections):
     told = []
     for i, fault in enumerate(faults):
         some = runs.isel(run=slice(RUNS * i, RUNS * (i + 1)))
-        told += BayesDiagnoser(twin, imperfections, (fault,)).diagnose(some)
-    found = BayesDiagnoser(twin, imperfections, (HEALTHY, *faults)).diagnose(runs)
+        told += BayesDiagnoser(twin, imperfections, (fault,), KNOWN_SET_UP).diagnose(some)
+    found = BayesDiagnoser(twin, imperfections, (HEALTHY, *faults), KNOWN_SET_UP).diagnose(runs)
     return Study(runs, told, found)
 
 

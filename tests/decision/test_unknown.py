@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from failuretwin import BayesDiagnoser
+from failuretwin import BayesDiagnoser, Priors, SetupPrior
 from failuretwin.core.hypothesis import (
     HEALTHY,
     UNKNOWN,
@@ -34,6 +34,17 @@ def diagnoser(twin, armpi):
     return BayesDiagnoser(twin, hypotheses=(*paper_hypotheses(armpi.motor_names), UNKNOWN))
 
 
+KNOWN_SET_UP = Priors(setup=SetupPrior.known())
+"""Without the search for wrong set-ups, which takes longer than everything else."""
+
+
+@pytest.fixture(scope="module", params=["known", pytest.param("asked", marks=pytest.mark.slow)])
+def either(request, twin, diagnoser):
+    """The same where nothing but a fault can explain a run, and where a wrong set-up may too."""
+    priors = KNOWN_SET_UP if request.param == "known" else Priors()
+    return BayesDiagnoser(twin, hypotheses=diagnoser.hypothesis_set, priors=priors)
+
+
 @pytest.fixture(scope="module")
 def thrown_off(armpi):
     """Two motors at once miss every target by 8 to 12 degrees."""
@@ -46,9 +57,9 @@ def thrown_off(armpi):
     return simulate(Plan(armpi, TWO_AT_ONCE, 8, 6, known, modes=modes))
 
 
-def test_two_faults_that_are_not_offered_are_unknown(diagnoser, thrown_off):
+def test_two_faults_that_are_not_offered_are_unknown(either, thrown_off):
     """No single fault brings the tool there; it is not said to be one of those offered."""
-    found = diagnoser.diagnose(thrown_off)
+    found = either.diagnose(thrown_off)
     told = [d.diagnosis for d in found]
     assert told.count("unknown") >= 0.9 * len(found)
     for d in (d for d in found if d.diagnosis == "unknown"):
@@ -58,7 +69,9 @@ def test_two_faults_that_are_not_offered_are_unknown(diagnoser, thrown_off):
 
 def test_two_faults_that_are_offered_are_known(twin, armpi, thrown_off):
     offered = (*paper_hypotheses(armpi.motor_names), *TWO_AT_ONCE, UNKNOWN)
-    found = BayesDiagnoser(twin, hypotheses=offered).diagnose(thrown_off.isel(run=[0, 1, 8, 9]))
+    found = BayesDiagnoser(twin, hypotheses=offered, priors=KNOWN_SET_UP).diagnose(
+        thrown_off.isel(run=[0, 1, 8, 9])
+    )
     assert [d.diagnosis for d in found] == [d.truth for d in found]
 
 
@@ -95,15 +108,17 @@ def test_modes_without_a_law_are_unknown(twin, armpi, foreign, monkeypatch):
     monkeypatch.setattr(weighing, "unlisted", few)
     scales = np.char.endswith(foreign["fault"].values.astype(str), "encoder_scale")
     offered = (*paper_hypotheses(armpi.motor_names), UNKNOWN)
-    found = BayesDiagnoser(twin, hypotheses=offered).diagnose(foreign.isel(run=scales))
+    found = BayesDiagnoser(twin, hypotheses=offered, priors=KNOWN_SET_UP).diagnose(
+        foreign.isel(run=scales)
+    )
     assert np.mean([d.diagnosis == "unknown" for d in found]) >= 0.8
 
 
-def test_known_faults_stay_known(diagnoser, imperfect, diagnoses):
+def test_known_faults_stay_known(either, imperfect, diagnoses):
     """Offering `unknown` turns hardly any right diagnosis: 1.7 % of 900 (docs/inference.md)."""
-    right = np.flatnonzero([d.diagnosis == d.truth for d in diagnoses])
-    found = diagnoser.diagnose(imperfect.isel(run=right))
-    assert np.mean([d.diagnosis == d.truth for d in found]) >= 0.96
+    right = np.flatnonzero([d.diagnosis == d.truth for d in diagnoses])[::2]
+    found = either.diagnose(imperfect.isel(run=right))
+    assert np.mean([d.diagnosis == d.truth for d in found]) >= 0.95
 
 
 def test_known_hypotheses_weigh_the_same_beside_unknown(diagnoser, imperfect, armpi):
@@ -150,15 +165,15 @@ def test_without_evidence_unknown_is_as_rare_as_it_was(diagnoser, imperfect):
 @pytest.mark.parametrize(
     ("name", "least"),
     [
-        ("motor_1:stuck+motor_2:stuck", 23),
-        ("motor_2:encoder_bias+motor_3:stuck", 21),
-        ("motor_2:encoder_scale", 20),
+        ("motor_1:stuck+motor_2:stuck", 7),
+        ("motor_2:encoder_bias+motor_3:stuck", 7),
+        ("motor_2:encoder_scale", 7),
     ],
 )
 def test_what_is_named_is_not_taken_for_unknown(twin, measured_armpi, name, least):
     """Also where ends of movements are unseen, and two held motors point elsewhere than each."""
     truth = Hypothesis.parse(name)
-    runs = simulate(Plan(twin.robot, [truth], 24, 13, measured_armpi))
+    runs = simulate(Plan(twin.robot, [truth], 8, 13, measured_armpi))
     offered = [HEALTHY, truth, Hypothesis.parse("motor_1:stuck"), UNKNOWN]
     found = BayesDiagnoser(twin, measured_armpi, offered).diagnose(runs)
     assert sum(d.diagnosis == name for d in found) >= least

@@ -86,7 +86,7 @@ def test_zeros_and_play_are_found_from_both_sides(model, designed):
 
 def test_intervals_of_zeros_and_play_contain_the_truth(model, designed):
     rng, away = np.random.default_rng(0), []
-    for _ in range(20):
+    for _ in range(10):
         off, play = 0.01 * rng.standard_normal((2, 4))
         noise = scattered(model, designed, rng)
         found = offsets_of(model, seen_of(model, designed, off, play, noise))

@@ -11,7 +11,7 @@ Section: docs/inference.md#outcomes
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated, TypeVar
 
 import numpy as np
@@ -77,15 +77,21 @@ class ConsecutiveLossHmm:
         chances = np.empty((runs, count, len(self.missed)))
         state = np.zeros((runs, len(self.missed)))
         state[:, 0] = 1.0
-        follows = csr_array(self.transition.reshape(-1, len(self.missed)))  # one of each row
         for m in range(count):
             pairs = rates[:, m, :, None] * state[:, None]
-            chances[:, m] = state = np.asarray(pairs.reshape(runs, follows.shape[0]) @ follows)
+            chances[:, m] = state = (
+                self._follows @ pairs.reshape(runs, self._follows.shape[1]).T
+            ).T
             if log_likelihood is not None:
                 says = np.where(state > 0.0, log_likelihood[:, m], -np.inf)
                 state = state * np.exp(says - says.max(axis=-1, keepdims=True))
                 state = state / state.sum(axis=-1, keepdims=True)
         return chances
+
+    @cached_property
+    def _follows(self) -> csr_array:
+        """1 where a state follows a loss in a state, (state, loss and state)."""
+        return csr_array(self.transition.reshape(-1, len(self.missed)).T)
 
 
 def _states(
@@ -126,6 +132,14 @@ def _known(missed: tuple[int, ...], states: list[tuple[int, ...]]) -> tuple[int,
         longest = max(missed)
         missed = tuple(n - 1 if n == longest else n for n in missed)
     return missed
+
+
+@lru_cache(maxsize=128)
+def _usual_chain(
+    losses: tuple[tuple[bool, ...], ...], chance: tuple[float, ...], most: tuple[float, ...]
+) -> ConsecutiveLossHmm:
+    """Return `ConsecutiveLossHmm.of`; robots that are weighed again and again have the same."""
+    return ConsecutiveLossHmm.of(np.array(losses), np.array(chance), RARE, np.array(most))
 
 
 OUTLIER_RATE = 0.01
@@ -290,7 +304,8 @@ class LostCommands:
         late_rate = self.imperfections.timing.late_rate
         usual = self._rates(np.array(late_rate))
         most = self._rates(np.array([0.0, float(late_rate > 0.0)])).max(axis=0)
-        return ConsecutiveLossHmm.of(self._losses, usual, RARE, most)
+        hits = tuple(map(tuple, self._losses.tolist()))
+        return _usual_chain(hits, tuple(usual.tolist()), tuple(most.tolist()))
 
     @staticmethod
     def _log_weight(chances: FloatArray) -> FloatArray:
