@@ -23,9 +23,9 @@ from killian_truth import TrueRun, read_list
 import failuretwin as ft
 from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, single_faults
-from failuretwin.decision.evaluation import score_line
+from failuretwin.decision.evaluation import Judged, score_line
 from failuretwin.decision.results import write_json_lines
-from failuretwin.decision.scoring import Scores, Share
+from failuretwin.decision.scoring import Share
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections
@@ -99,14 +99,13 @@ def with_own_calibration(
 
 def report(name: str, listed: Sequence[TrueRun], diagnoses: Sequence[Diagnosis]) -> None:
     """Print how many are right, by kind of fault, and the wrong ones."""
-    scores = Scores.of(d for run, d in zip(listed, diagnoses, strict=True) if run.judged)
-    print(f"{name}: {score_line(scores)}")
-    for i, (name, row) in enumerate(zip(scores.classes, scores.confusion, strict=True)):
-        if row.any():
-            recall = Share(int(row[i]), int(row.sum()))
-            low, high = recall.interval
-            counts = f"{recall.count} of {recall.total}"
-            print(f"  {name}: {counts} ({100 * low:.0f} to {100 * high:.0f} %)")
+    judged = Judged.of(d for run, d in zip(listed, diagnoses, strict=True) if run.judged)
+    print(f"{name}: {score_line(judged)}")
+    for row in judged.scores.by_class():
+        if row.runs:
+            hits = round(row.recall * row.runs)
+            low, high = Share(hits, row.runs).interval
+            print(f"  {row.name}: {hits} of {row.runs} ({100 * low:.0f} to {100 * high:.0f} %)")
     healthy = [d for d in diagnoses if d.truth == "healthy"]
     alarms = sum(d.diagnosis not in ("healthy", None) for d in healthy)
     silent = sum(d.diagnosis is None for d in healthy)

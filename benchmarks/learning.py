@@ -18,10 +18,11 @@ from failuretwin import load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
-from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of, signals_of
 from failuretwin.decision.learned.networks import (
     NETWORKS,
     Batch,
+    Pace,
     Shape,
     Standard,
     build_network,
@@ -48,7 +49,7 @@ def paper_training(cores: int) -> float:
     classes = rng.integers(0, 9, 3240)
     torch.set_num_threads(cores)
     network = build_network("lstm", Shape(6, 9))
-    steps = training(network, shuffled_batches(features, classes, 32, rng), 1000)
+    steps = training(network, shuffled_batches(features, classes, 32, rng), Pace(1000))
     for _ in itertools.islice(steps, 10):
         pass
     begun, timed = time.perf_counter(), 60
@@ -106,7 +107,7 @@ def exported(name: str, encoder: FeatureEncoder, folder: Path) -> tuple[float, f
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(folder / "network.onnx", options)
-    features = encoder.encode(runs.isel(run=[0]))
+    features = encoder.encode(signals_of(runs.isel(run=[0])))
     diagnose = run_path(str(folder / "network.py"))["diagnose"]
     time_s, command, measured = (
         values.values for values in (runs["time"], runs["command"][0], runs["measured"][0])

@@ -29,9 +29,8 @@ from failuretwin.connection.calibration.result import Calibration
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.readers.raw_sessions import find_sessions
-from failuretwin.decision.evaluation import compare, score_line
+from failuretwin.decision.evaluation import Judged, compare, score_line
 from failuretwin.decision.results import write_json_lines
-from failuretwin.decision.scoring import Scores
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, sag
@@ -97,10 +96,10 @@ def main() -> None:
             method.found += found
             if method is judged and options.plot is not None:
                 _plot_wrong(found, runs, robot, options.plot)
-    print(f"{judged.name}: {score_line(Scores.of(judged.found))}")
+    print(f"{judged.name}: {score_line(Judged.of(judged.found))}")
     print(f"  {held_angles(judged.found, truth)}")
     for method in beside:
-        print(f"{method.name}: {score_line(Scores.of(method.found))}")
+        print(f"{method.name}: {score_line(Judged.of(method.found))}")
         print(f"  {_compare(method.found, judged.found)}")
     for diagnosis in judged.found:
         if diagnosis.diagnosis != diagnosis.truth:

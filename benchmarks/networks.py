@@ -19,7 +19,12 @@ from failuretwin.data_knowledge.generate import simulate
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import load_network, save_network
-from failuretwin.decision.scoring import Split, log_score, log_score_gain, reliability
+from failuretwin.decision.scoring import (
+    log_score,
+    log_score_gain,
+    mcnemar,
+    reliability,
+)
 from failuretwin.decision.training import TrainingPlan, train_network
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
@@ -79,7 +84,7 @@ def compare(first: Sequence[Diagnosis], second: Sequence[Diagnosis], words: str)
     """Print by how much the second is better than the first on the same runs."""
     gain = log_score_gain(nats_of(first), nats_of(second), np.random.default_rng(0))
     right = [np.array([d.diagnosis == d.truth for d in said]) for said in (first, second)]
-    test = Split.of(*right)
+    test = mcnemar(*right)
     low, high = gain.interval
     print(
         f"{words}: {gain.mean:+.4f} nats a run (95 % {low:+.4f} to {high:+.4f}); right by one "

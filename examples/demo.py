@@ -21,7 +21,7 @@ for first in range(0, len(diagnoses), RUNS_PER_CLASS):
     same = diagnoses[first : first + RUNS_PER_CLASS]
     right = sum(d.diagnosis == d.truth for d in same)
     print(f"{same[0].truth:30s} {right:2d} of {len(same)} right, such as: {same[0].verdict}")
-scores = ft.evaluate(diagnoses)
+scores = ft.evaluate(diagnoses).judged.scores
 low, high = (100 * end for end in scores.interval)
 share = f"{scores.right} of {scores.runs} simulated runs right"
 print(f"{share} (95 % interval {low:.0f} to {high:.0f} %)")

@@ -59,7 +59,7 @@ def test_names_and_paths_do_where_values_do(runs, tmp_path):
 
 def test_diagnoses_are_scored_in_one_call(runs, tmp_path):
     found = ft.diagnose(runs, calibration="none", hypotheses=["healthy", "motor_1:stuck"])
-    scores = ft.evaluate(found, runs)
+    scores = ft.evaluate(found, runs).judged.scores
     assert (scores.right, scores.runs) == (4, 4)
 
 

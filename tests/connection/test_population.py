@@ -369,7 +369,7 @@ def test_strangers_of_a_fleet_are_judged_better_than_by_their_class(armpi):
         runs = simulate(Plan(armpi, TRUTHS, 1, seed, vary(FLEET, rng), RandomMovements(count=3)))
         for name, prior in (("fleet", population), ("class", None)):
             found = SelfCalibratingDiagnoser(armpi, prior).diagnose(runs)
-            scores[name].append(evaluate(found, runs).log_score)
+            scores[name].append(evaluate(found, runs).judged.scores.log_score)
     assert np.mean(scores["fleet"]) < min(0.3, 0.6 * np.mean(scores["class"]))
     one = ft.BayesDiagnoser(armpi, population.imperfections).diagnose(runs.isel(run=[0]))
     assert (one[0].protocol, "population of 12 robots" in one[0].method) == ("P0", True)

@@ -13,7 +13,6 @@ from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.decision.evaluation import compare, evaluate
 from failuretwin.decision.results import Record, read_results, write_json_lines
-from failuretwin.decision.scoring import Share, reliability
 
 STUCK = "motor_1:stuck"
 
@@ -53,21 +52,21 @@ def runs():
 
 def test_diagnoses_are_evaluated_as_they_come():
     scores = evaluate(FOUND)
-    assert (scores.right, scores.runs) == (2, 4)
+    assert (scores.scores.right, scores.scores.runs) == (2, 4)
     # the truth has 3/4 in three runs and 1/4 in one
-    assert scores.log_score == pytest.approx(-(3 * math.log(0.75) + math.log(0.25)) / 4)
+    assert scores.scores.log_score == pytest.approx(-(3 * math.log(0.75) + math.log(0.25)) / 4)
     assert scores.brier == pytest.approx((3 * 0.125 + 1.125) / 4)
-    assert scores.missed == Share(2, 3)
-    assert scores.abstained == (0, 1)
-    assert reliability(*scores.decided).error == pytest.approx(0.75 - 2 / 3)
+    assert (scores.alarms.missed.count, scores.alarms.missed.total) == (2, 3)
+    assert scores.alarms.faulty_abstained == 1
+    assert scores.calibration.equal.error == pytest.approx(0.75 - 2 / 3)
     assert scores.coverage == []
-    assert scores.protocol == "P0"
+    assert scores.judged.protocol == "P0"
 
 
 def test_a_run_set_knows_the_truth_and_what_intervals_should_hold(runs):
     blind = [told(d.run, d.posterior[STUCK], None, onset_90=d.onset_90) for d in FOUND]
     scores = evaluate(blind, runs)
-    assert scores.right == 3
+    assert scores.scores.right == 3
     (onset,) = scores.coverage
     assert (onset.quantity, onset.mode, onset.inside.count, onset.inside.total) == (
         *("onset", "stuck", 1, 1),
@@ -89,8 +88,8 @@ def test_the_same_is_said_of_what_was_written_and_read(tmp_path):
     assert stored.diagnoses[3].diagnosis is None
     direct, again = evaluate(FOUND), evaluate(stored)
     assert again.brier == direct.brier
-    np.testing.assert_array_equal(again.confusion, direct.confusion)
-    np.testing.assert_array_equal(again.decided, direct.decided)
+    np.testing.assert_array_equal(again.scores.confusion, direct.scores.confusion)
+    np.testing.assert_array_equal(again.calibration.by_chance, direct.calibration.by_chance)
 
 
 def test_two_methods_are_compared_run_by_run():

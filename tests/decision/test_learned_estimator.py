@@ -15,7 +15,7 @@ from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.decision import training as stream_module
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser, best_temperature, probabilities
-from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of, signals_of
 from failuretwin.decision.learned.networks import Standard
 from failuretwin.decision.training import CHUNK_RUNS, Stream, TrainingData
 from user_modes import code_on_the_page, registered_from
@@ -94,7 +94,7 @@ def test_it_can_be_cloned_and_cross_validated(encoder, runs, trained):
     fresh = clone(trained)
     assert fresh.get_params()["network"] == "cnn"
     assert not hasattr(fresh, "network_")
-    features = encoder.encode(runs)
+    features = encoder.encode(signals_of(runs))
     quick = LearnedDiagnoser("cnn", iterations=20, random_state=0)
     scores = cross_val_score(quick, features, runs["fault"].values, cv=2)
     assert len(scores) == 2

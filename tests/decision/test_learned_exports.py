@@ -14,7 +14,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
-from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of, signals_of
 from failuretwin.decision.learned.log_pool import PoolWeights
 from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import (
@@ -78,7 +78,7 @@ def test_onnx_runtime_agrees(trained, runs, network, tmp_path):
     path = tmp_path / "network.onnx"
     export_onnx(trained[network], path)
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    features = trained[network].encoder.encode(runs)
+    features = trained[network].encoder.encode(signals_of(runs))
     for count in (1, 36):
         (chances,) = session.run(None, {"features": features[:count]})
         np.testing.assert_allclose(

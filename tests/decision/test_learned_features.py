@@ -11,6 +11,7 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.decision.learned.feature_encoder import (
     FeatureEncoder,
     expectation_of,
+    signals_of,
 )
 from failuretwin.digital_model.nonidealities import Imperfections, Readings
 from failuretwin.digital_model.settling import Settling
@@ -38,7 +39,7 @@ def some_runs(robot, hypothesis, imperfections=SAGGING):
 def expecting(imperfections, robot, runs):
     """Return robust features of a robot that is expected to have some imperfections."""
     encoder = FeatureEncoder("robust", robot, expectation_of(robot, imperfections))
-    return encoder.encode(runs)
+    return encoder.encode(signals_of(runs))
 
 
 def undo(values, scale):
@@ -60,7 +61,7 @@ def settled(points=100):
 
 def test_original_features_are_every_tenth_sample(armpi):
     runs = simulate(Plan(armpi, (Hypothesis(),), 2, 1))
-    features = FeatureEncoder("original", armpi).encode(runs)
+    features = FeatureEncoder("original", armpi).encode(signals_of(runs))
     assert features.shape == (2, 100, 7)
     np.testing.assert_allclose(features[..., :4], runs["command"].values[:, ::10], atol=1e-6)
     np.testing.assert_allclose(features[..., 4:], runs["measured"].values[:, ::10], atol=1e-6)
@@ -68,7 +69,7 @@ def test_original_features_are_every_tenth_sample(armpi):
 
 def test_augmented_features_begin_straight_up_and_vanish_at_rest(armpi):
     runs = simulate(Plan(armpi, (Hypothesis(),), 1, 1))
-    features = FeatureEncoder("augmented", armpi).encode(runs)
+    features = FeatureEncoder("augmented", armpi).encode(signals_of(runs))
     straight = 0.310509  # zero pose, published kinematics
     np.testing.assert_allclose(features[0, 0], [0.0, 0.0, straight, 0.0, 0.0, 0.0], atol=1e-6)
     assert np.abs(features[0, 19::20, 3:]).max() < 1e-3
@@ -80,13 +81,13 @@ def test_gaps_are_filled_by_straight_lines(armpi):
     line = np.linspace(0.0, 1.0, runs.sizes["time"])[:, None] * [1.0, 2.0, 3.0]
     runs["measured"].values[0] = line
     runs["measured"].values[0, 203:477] = np.nan
-    features = FeatureEncoder("original", armpi).encode(runs)
+    features = FeatureEncoder("original", armpi).encode(signals_of(runs))
     np.testing.assert_allclose(features[0, :, 4:], line[::10], atol=1e-6)
 
 
 @pytest.mark.parametrize(("name", "channels"), [("original", 7), ("augmented", 6), ("robust", 20)])
 def test_channels_of_four_motors(armpi, name, channels):
-    features = FeatureEncoder(name, armpi).encode(some_runs(armpi, "healthy"))
+    features = FeatureEncoder(name, armpi).encode(signals_of(some_runs(armpi, "healthy")))
     assert features.shape == (5, 100, channels)
     assert np.isfinite(features).all()
 
@@ -109,9 +110,11 @@ def test_joint_axes_are_those_that_the_tool_turns_about(armpi, twin):
 
 def test_nothing_is_off_on_a_healthy_arm_at_rest(armpi):
     runs = some_runs(armpi, "healthy")
-    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(runs)
+    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(
+        signals_of(runs)
+    )
     turn = undo(channel(armpi, features, "turn")[:, settled()], TURN_RAD)
-    plain = FeatureEncoder("robust", armpi).encode(runs)
+    plain = FeatureEncoder("robust", armpi).encode(signals_of(runs))
     without = undo(channel(armpi, plain, "turn")[:, settled()], TURN_RAD)
     assert np.abs(turn).max() < 0.004  # sag is taken at the commanded pose, not at the sagging one
     assert np.abs(without).max() > 0.03  # ideal motors are expected: they do sag
@@ -120,7 +123,9 @@ def test_nothing_is_off_on_a_healthy_arm_at_rest(armpi):
 @pytest.mark.parametrize("motor", [0, 1, 2, 3])
 def test_a_stuck_motor_explains_all_and_keeps_its_angle(armpi, motor):
     runs = some_runs(armpi, f"motor_{motor + 1}:stuck")
-    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(runs)
+    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(
+        signals_of(runs)
+    )
     misfit = undo(channel(armpi, features, "misfit")[:, settled()], DISTANCE_M)
     angle = channel(armpi, features, "angle")[:, settled(), motor]
     median = np.median(misfit, axis=(0, 1))
@@ -132,7 +137,9 @@ def test_a_stuck_motor_explains_all_and_keeps_its_angle(armpi, motor):
 
 def test_errors_of_a_motor_are_read_off_its_channel(armpi):
     runs = some_runs(armpi, "motor_2:steady_state_error")
-    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(runs)
+    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(
+        signals_of(runs)
+    )
     turn = undo(channel(armpi, features, "turn")[..., 1], TURN_RAD)[:, 19::20]
     true = [json.loads(text)["faults"][0]["offset_rad"] for text in runs["fault_detail"].values]
     assert np.median(np.abs(turn - true)) < 0.01
@@ -142,7 +149,9 @@ def test_errors_of_a_motor_are_read_off_its_channel(armpi):
 def test_points_without_a_reading_are_marked_and_say_nothing(armpi):
     runs = some_runs(armpi, "motor_1:stuck")
     runs["measured"].values[:, 300:600] = np.nan
-    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(runs)
+    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(
+        signals_of(runs)
+    )
     missing = slice(31, 59)
     assert not features[:, missing, -1].any()
     assert features[:, :30, -1].all()
@@ -154,7 +163,9 @@ def test_points_without_a_reading_are_marked_and_say_nothing(armpi):
 def test_a_glitch_counts_little_more_than_a_fault(armpi):
     runs = some_runs(armpi, "healthy")
     runs["measured"].values[:, 500] = 5.0  # far outside the workspace
-    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(runs)
+    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(
+        signals_of(runs)
+    )
     assert np.abs(features).max() < 4.0
 
 

@@ -14,12 +14,12 @@ from sklearn.metrics import brier_score_loss, log_loss
 
 from failuretwin.core.errors import InputError
 from failuretwin.decision.scoring import (
-    Split,
     adaptive_edges,
     brier_score,
     calibrated_error,
     log_score,
     log_score_gain,
+    mcnemar,
     reliability,
 )
 
@@ -148,14 +148,14 @@ def test_mcnemar_counts_every_equally_likely_split(only_first):
     first = np.arange(8) < only_first
     ways = [sum(way) for way in product((0, 1), repeat=8)]
     uneven = sum(abs(way - 4) >= abs(only_first - 4) for way in ways)
-    test = Split.of(np.r_[first, True, True, False], np.r_[~first, True, True, False])
+    test = mcnemar(np.r_[first, True, True, False], np.r_[~first, True, True, False])
     assert test.p == pytest.approx(uneven / 256)
     assert (test.both, test.neither) == (2, 1)
     assert (test.first_only, test.second_only) == (only_first, 8 - only_first)
 
 
 def test_methods_that_never_differ_are_as_good():
-    assert Split.of(np.ones(5, dtype=bool), np.ones(5, dtype=bool)).p == 1.0
+    assert mcnemar(np.ones(5, dtype=bool), np.ones(5, dtype=bool)).p == 1.0
 
 
 def test_bootstrap_interval_is_that_of_scipy():
@@ -188,8 +188,8 @@ def test_truths_that_were_ruled_out_are_told_apart():
     gain = log_score_gain(first, second, np.random.default_rng(0))
     assert gain.mean == inf
     assert gain.finite_mean == pytest.approx(0.75)
-    assert gain.runs == 2
-    assert gain.impossible == Split(both=1, first_only=1, second_only=0, neither=2)
+    assert (gain.runs, gain.first_impossible, gain.both_impossible) == (2, 1, 1)
+    assert gain.second_impossible == 0
     other = log_score_gain(second, first, np.random.default_rng(0))
     assert (other.mean, other.finite_mean) == (-inf, -gain.finite_mean)
 

@@ -13,11 +13,11 @@ from failuretwin.decision.scoring import (
     NO_VERDICT,
     Coverage,
     IntervalCase,
-    Scores,
     Share,
-    class_ratios,
+    count_alarms,
     coverage_by_mode,
     judged_truth,
+    score_diagnoses,
 )
 
 TRUTH = ["a", "a", "a", "b", "b", "c"]
@@ -32,7 +32,7 @@ def scores():
     for truth, chance in zip(TRUTH, CHANCE, strict=True):
         others = [name for name in "abc" if name != truth]
         posterior.append(dict.fromkeys(others, (1 - chance) / 2) | {truth: chance})
-    return Scores(TRUTH, SAID, posterior)
+    return score_diagnoses(TRUTH, SAID, posterior)
 
 
 def test_confusion_has_a_row_for_each_truth(scores):
@@ -42,22 +42,24 @@ def test_confusion_has_a_row_for_each_truth(scores):
     )
     assert (scores.right, scores.runs) == (3, 6)
     assert scores.accuracy == 0.5
-    assert scores.share == Share(3, 6)
+    assert scores.interval == Share(3, 6).interval
 
 
 def test_classes_are_scored_apart(scores):
-    ratios = class_ratios(scores.confusion)
-    a, b, c = (ratios[scores.classes.index(name)] for name in "abc")
-    assert a.tolist() == pytest.approx([2 / 4, 2 / 3, 2 * 2 / (4 + 3)])
-    assert b.tolist() == [0.5, 0.5, 0.5]
-    assert c.tolist() == pytest.approx([np.nan, 0.0, 0.0], nan_ok=True)
+    a, b, c = (next(row for row in scores.by_class() if row.name == name) for name in "abc")
+    assert (a.runs, a.precision, a.recall) == (3, 2 / 4, pytest.approx(2 / 3))
+    assert a.f1 == pytest.approx(2 * 2 / (4 + 3))
+    assert (b.runs, b.precision, b.recall, b.f1) == (2, 0.5, 0.5, 0.5)
+    assert (c.runs, c.recall, c.f1) == (1, 0.0, 0.0)
+    assert np.isnan(c.precision)
     assert scores.macro_f1 == pytest.approx((4 / 7 + 1 / 2 + 0) / 3)
 
 
 def test_a_class_that_is_neither_true_nor_said_has_no_scores():
-    scores = Scores(["a"], ["a"], [{"a": 0.9, "b": 0.1}])
-    assert scores.classes == ("a", "b")
-    assert np.isnan(class_ratios(scores.confusion)[1]).all()
+    scores = score_diagnoses(["a"], ["a"], [{"a": 0.9, "b": 0.1}])
+    b = scores.by_class()[1]
+    assert (b.name, b.runs) == ("b", 0)
+    assert np.isnan([b.precision, b.recall, b.f1]).all()
     assert scores.macro_f1 == 1.0
 
 
@@ -67,11 +69,11 @@ pairs = st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from([*"abcd", Non
 @given(pairs)
 def test_scores_are_those_of_scikit_learn(answers):
     truth, said = [true for true, _ in answers], [said for _, said in answers]
-    scores = Scores(truth, said, [{"a": 0.5, "b": 0.5}] * len(answers))
+    scores = score_diagnoses(truth, said, [{"a": 0.5, "b": 0.5}] * len(answers))
     words = [NO_VERDICT if word is None else word for word in said]
     labels = list(scores.classes)
     np.testing.assert_array_equal(scores.confusion, confusion_matrix(truth, words, labels=labels))
-    ours = class_ratios(scores.confusion).T
+    ours = np.array([(row.precision, row.recall, row.f1) for row in scores.by_class()]).T
     expected = precision_recall_fscore_support(
         truth, words, labels=labels, zero_division=float("nan")
     )
@@ -89,13 +91,13 @@ def test_the_log_score_says_when_the_truth_was_ruled_out(scores):
 
 
 def test_certainty_of_the_truth_costs_nothing():
-    scores = Scores(["a", "b"], ["a", "b"], [{"a": 1.0, "b": 0.0}, {"a": 0.0, "b": 1.0}])
+    scores = score_diagnoses(["a", "b"], ["a", "b"], [{"a": 1.0, "b": 0.0}, {"a": 0.0, "b": 1.0}])
     assert scores.log_score == 0.0
     assert scores.accuracy == 1.0
 
 
 def test_truth_that_no_hypothesis_stands_for_counts_as_wrong():
-    scores = Scores(["d"], ["a"], [{"a": 0.9, "b": 0.1}])
+    scores = score_diagnoses(["d"], ["a"], [{"a": 0.9, "b": 0.1}])
     assert (scores.right, scores.runs) == (0, 1)
     assert scores.log_score == np.inf
     assert set(scores.classes) == {"a", "b", "d"}
@@ -130,19 +132,18 @@ def test_a_share_of_nothing_is_not_known():
 
 
 def test_any_other_verdict_on_a_healthy_run_is_a_false_alarm():
-    said = ["healthy", "motor_1:stuck", "unknown", None, "healthy"]
-    scores = Scores(["healthy"] * 5, said, [{}] * 5)
-    assert scores.false_alarms == Share(2, 5)
-    assert scores.abstained == (1, 0)
-    assert scores.missed == Share(0, 0)
+    alarms = count_alarms(["healthy"] * 5, ["healthy", "motor_1:stuck", "unknown", None, "healthy"])
+    assert alarms.false_alarms == Share(2, 5)
+    assert alarms.healthy_abstained == 1
+    assert alarms.missed == Share(0, 0)
 
 
 def test_a_fault_is_missed_where_no_alarm_is_raised_whatever_its_name():
     said = ["motor_1:stuck", "motor_2:stuck", "unknown", "healthy", None, None]
-    scores = Scores(["motor_1:stuck"] * 5 + ["unknown"], said, [{}] * 6)
-    assert scores.missed == Share(3, 6)
-    assert scores.abstained == (0, 2)
-    assert scores.false_alarms == Share(0, 0)
+    alarms = count_alarms(["motor_1:stuck"] * 5 + ["unknown"], said)
+    assert alarms.missed == Share(3, 6)
+    assert alarms.faulty_abstained == 2
+    assert alarms.false_alarms == Share(0, 0)
 
 
 def test_truths_are_counted_on_either_side():

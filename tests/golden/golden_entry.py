@@ -14,12 +14,12 @@ from failuretwin.connection.calibration.observations import observe
 from failuretwin.core.hypothesis import parse_hypotheses
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.decision.learned.feature_encoder import (
+    RobustFeatures,
     augmented_features,
     expectation_of,
     original_features,
     signals_of,
 )
-from failuretwin.decision.learned.feature_encoder import robust_features as robust
 from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.digital_model.arm_classes import generic_imperfections
@@ -73,7 +73,7 @@ def healthy(which, robot):
 
 
 def robust_features(robot, imperfections, runs):
-    return robust(robot, expectation_of(robot, imperfections), signals_of(runs))
+    return RobustFeatures(robot, expectation_of(robot, imperfections))(signals_of(runs))
 
 
 def evidence_of(diagnoser, runs):

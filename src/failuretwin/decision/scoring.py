@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.core.errors import InputError, counted
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.decision.results import Record
 
 
 @dataclass(frozen=True)
@@ -40,10 +35,151 @@ class Share:
         return float(low), float(high)
 
 
+# Accuracy, confusion matrix, precision, recall and F1.
+
+NO_VERDICT = "cannot tell"
+"""Class of the runs without a verdict."""
+UNKNOWN, HEALTHY = "unknown", "healthy"
+
+
+def judged_truth(truth: str, hypotheses: Container[str]) -> str:
+    """Return the correct answer for a run among these hypotheses.
+
+    It is `unknown` if the true fault is not among the hypotheses and `unknown` is; otherwise the
+    truth itself. A healthy robot is never `unknown`.
+    """
+    if truth == HEALTHY or truth in hypotheses or UNKNOWN not in hypotheses:
+        return truth
+    return UNKNOWN
+
+
+@dataclass(frozen=True)
+class ClassScore:
+    """Scores of one class; `runs` have it as truth. Ratios of 0 / 0 are NaN."""
+
+    name: str
+    runs: int
+    precision: float
+    recall: float
+    f1: float
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Accuracy and log score of a set of diagnoses.
+
+    Attributes:
+        classes: Hypotheses in the order of the confusion matrix.
+        confusion: Counts, (truth, diagnosis).
+        nats: Log score of each run, (run,) [nats]; infinite where the truth has probability 0.
+    """
+
+    classes: tuple[str, ...]
+    confusion: IntArray
+    nats: FloatArray
+
+    @property
+    def log_score(self) -> float:
+        """Mean log score [nats per run]; may be infinite."""
+        return float(np.mean(self.nats))
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return int(self.confusion.sum())
+
+    @property
+    def right(self) -> int:
+        """Number of correctly diagnosed runs."""
+        return int(np.trace(self.confusion))
+
+    @property
+    def accuracy(self) -> float:
+        """Share of correctly diagnosed runs."""
+        return self.right / self.runs
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson 95 % interval of the accuracy."""
+        return Share(self.right, self.runs).interval
+
+    @property
+    def macro_f1(self) -> float:
+        """Mean F1 of the classes that are the truth of any run, equally weighted."""
+        return float(np.mean([row.f1 for row in self.by_class() if row.runs]))
+
+    def by_class(self) -> list[ClassScore]:
+        """Return precision, recall and F1 of each class."""
+        runs, ratios = self.confusion.sum(axis=1).tolist(), class_ratios(self.confusion).tolist()
+        rows = zip(self.classes, runs, ratios, strict=True)
+        return [ClassScore(name, count, *ratio) for name, count, ratio in rows]
+
+
+def class_ratios(confusion: IntArray) -> FloatArray:
+    """Return precision, recall and F1 of each class, (..., class, 3); 0 / 0 is NaN.
+
+    F1 = 2 hits / (runs + diagnoses). The confusion matrix holds counts (..., truth, diagnosis).
+    """
+    hits = np.diagonal(confusion, axis1=-2, axis2=-1)
+    runs, diagnoses = confusion.sum(axis=-1), confusion.sum(axis=-2)
+    with np.errstate(invalid="ignore"):
+        return np.stack([hits / diagnoses, hits / runs, 2 * hits / (runs + diagnoses)], axis=-1)
+
+
+def score_diagnoses(
+    truth: Sequence[str],
+    diagnosis: Sequence[str | None],
+    posterior: Sequence[Mapping[str, float]],
+) -> Scores:
+    """Score the diagnosis of each run; None is a class of its own, `NO_VERDICT`."""
+    verdicts = [NO_VERDICT if verdict is None else verdict for verdict in diagnosis]
+    names = [name for p in posterior for name in p]
+    classes = tuple(dict.fromkeys([*names, *truth, *verdicts]))
+    index = {name: i for i, name in enumerate(classes)}
+    confusion = np.zeros((len(classes), len(classes)), dtype=np.int64)
+    for true, verdict in zip(truth, verdicts, strict=True):
+        confusion[index[true], index[verdict]] += 1
+    return Scores(classes, confusion, log_score(truth, posterior))
+
+
+# False alarms and missed detections.
+
+
+@dataclass(frozen=True)
+class Alarms:
+    """False alarms and missed detections; an alarm is a verdict other than healthy.
+
+    Attributes:
+        false_alarms: Healthy runs with an alarm, of all healthy runs.
+        missed: Faulty runs without an alarm, of all faulty runs.
+        healthy_abstained: Healthy runs without a verdict.
+        faulty_abstained: Faulty runs without a verdict; included in `missed`.
+    """
+
+    false_alarms: Share
+    missed: Share
+    healthy_abstained: int
+    faulty_abstained: int
+
+
+def count_alarms(truth: Sequence[str], diagnosis: Sequence[str | None]) -> Alarms:
+    """Count false alarms and missed detections; a diagnosis of None is no verdict."""
+    pairs = list(zip(truth, diagnosis, strict=True))
+    healthy = [verdict for true, verdict in pairs if true == HEALTHY]
+    faulty = [verdict for true, verdict in pairs if true != HEALTHY]
+    return Alarms(
+        false_alarms=Share(sum(v not in (HEALTHY, None) for v in healthy), len(healthy)),
+        missed=Share(sum(v in (HEALTHY, None) for v in faulty), len(faulty)),
+        healthy_abstained=healthy.count(None),
+        faulty_abstained=faulty.count(None),
+    )
+
+
 # Coverage of 90 % intervals.
 
 
-class IntervalCase(NamedTuple):
+@dataclass(frozen=True)
+class IntervalCase:
     """Interval of a quantity of a fault mode, such as `onset`, and its true value."""
 
     mode: str
@@ -77,194 +213,20 @@ def coverage_by_mode(cases: Iterable[IntervalCase]) -> list[Coverage]:
 
     Pass runs whose fault was diagnosed correctly: an interval is conditional on the diagnosis.
     """
-    groups = defaultdict[tuple[str, str], list[list[float]]](list)
-    for mode, quantity, *numbers in cases:
-        groups[mode, quantity].append(numbers)
-    rows = []
-    for (mode, quantity), group in groups.items():
-        low, high, truth = np.array(group).T
-        below, above, points = (int(np.sum(w)) for w in (truth < low, truth > high, low == high))
-        inside = Share(len(group) - below - above, len(group))
-        rows.append(Coverage(mode, quantity, inside, below, above, points))
-    return rows
+    groups: dict[tuple[str, str], list[IntervalCase]] = {}
+    for case in cases:
+        groups.setdefault((case.mode, case.quantity), []).append(case)
+    return [_coverage(mode, quantity, group) for (mode, quantity), group in groups.items()]
 
 
-# Verdicts and probabilities.
-
-NO_VERDICT = "cannot tell"
-"""Class of the runs without a verdict."""
-UNKNOWN, HEALTHY = "unknown", "healthy"
-
-
-def judged_truth(truth: str, hypotheses: Container[str]) -> str:
-    """Return the correct answer for a run among these hypotheses.
-
-    It is `unknown` if the true fault is not among the hypotheses and `unknown` is; otherwise the
-    truth itself. A healthy robot is never `unknown`.
-    """
-    if truth == HEALTHY or truth in hypotheses or UNKNOWN not in hypotheses:
-        return truth
-    return UNKNOWN
+def _coverage(mode: str, quantity: str, group: Sequence[IntervalCase]) -> Coverage:
+    low, high, truth = np.array([(case.low, case.high, case.truth) for case in group]).T
+    below, above, points = (int(np.sum(w)) for w in (truth < low, truth > high, low == high))
+    inside = Share(len(group) - below - above, len(group))
+    return Coverage(mode, quantity, inside, below, above, points)
 
 
-@dataclass(frozen=True)
-class Scores:
-    """Scores of the diagnoses whose truth is known.
-
-    Attributes:
-        truth: Correct answer for each run; see `judged_truth`.
-        verdicts: Verdict on each run; None: no verdict.
-        posteriors: Probabilities of each run.
-        as_unknown: Number of runs whose correct answer is `unknown`, by true fault.
-        protocol: Protocol letters, joined by a slash.
-        cases: Intervals of the correctly diagnosed runs whose true values are known.
-    """
-
-    truth: Sequence[str]
-    verdicts: Sequence[str | None]
-    posteriors: Sequence[Mapping[str, float]]
-    as_unknown: Mapping[str, int] = field(default_factory=dict)
-    protocol: str = ""
-    cases: Sequence[IntervalCase] = ()
-
-    @classmethod
-    def of(
-        cls, diagnoses: Iterable[Diagnosis | Record], cases: Sequence[IntervalCase] = ()
-    ) -> Scores:
-        """Return the scores of diagnoses by the truth that they carry; others are left out."""
-        given = list(diagnoses)
-        told = [(d, d.truth) for d in given if d.truth]
-        judged = [judged_truth(fault, d.posterior) for d, fault in told]
-        return cls(
-            truth=judged,
-            verdicts=[d.diagnosis for d, _ in told],
-            posteriors=[d.posterior for d, _ in told],
-            as_unknown=Counter(t for (_, t), true in zip(told, judged, strict=True) if t != true),
-            protocol="/".join(sorted({d.protocol or "?" for d in given})),
-            cases=cases,
-        )
-
-    @property
-    def runs(self) -> int:
-        """Number of runs."""
-        return len(self.truth)
-
-    @property
-    def runs_and_protocol(self) -> str:
-        """Number of runs and protocol, as text."""
-        return f"{counted(self.runs, 'run')}, protocol {self.protocol}"
-
-    @property
-    def hits(self) -> BoolArray:
-        """Whether each run is diagnosed correctly, (run,)."""
-        pairs = zip(self.verdicts, self.truth, strict=True)
-        return np.array([verdict == true for verdict, true in pairs], dtype=np.bool_)
-
-    @property
-    def right(self) -> int:
-        """Number of correctly diagnosed runs."""
-        return int(self.hits.sum())
-
-    @property
-    def share(self) -> Share:
-        """Correctly diagnosed runs of all runs."""
-        return Share(self.right, self.runs)
-
-    @property
-    def accuracy(self) -> float:
-        """Share of correctly diagnosed runs."""
-        return self.share.value
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Wilson 95 % interval of the accuracy."""
-        return self.share.interval
-
-    @property
-    def false_alarms(self) -> Share:
-        """Healthy runs with an alarm, a verdict other than healthy, of all healthy runs."""
-        verdicts = self._verdicts_on(healthy=True)
-        return Share(sum(v not in (HEALTHY, None) for v in verdicts), len(verdicts))
-
-    @property
-    def missed(self) -> Share:
-        """Faulty runs without an alarm, of all faulty runs."""
-        verdicts = self._verdicts_on(healthy=False)
-        return Share(sum(v in (HEALTHY, None) for v in verdicts), len(verdicts))
-
-    @property
-    def abstained(self) -> tuple[int, int]:
-        """Healthy and faulty runs without a verdict; the faulty ones count as missed."""
-        healthy, faulty = (self._verdicts_on(healthy).count(None) for healthy in (True, False))
-        return healthy, faulty
-
-    def _verdicts_on(self, healthy: bool) -> list[str | None]:
-        pairs = zip(self.verdicts, self.truth, strict=True)
-        return [verdict for verdict, true in pairs if (true == HEALTHY) == healthy]
-
-    @cached_property
-    def classes(self) -> tuple[str, ...]:
-        """Hypotheses, truths and verdicts, in the order of the confusion matrix."""
-        names = [name for posterior in self.posteriors for name in posterior]
-        return tuple(dict.fromkeys([*names, *self.truth, *self._named]))
-
-    @property
-    def _named(self) -> list[str]:
-        return [NO_VERDICT if verdict is None else verdict for verdict in self.verdicts]
-
-    @cached_property
-    def confusion(self) -> IntArray:
-        """Counts, (truth, diagnosis); no verdict is a class of its own, `NO_VERDICT`."""
-        index = {name: i for i, name in enumerate(self.classes)}
-        cells = [[index[name] for name in names] for names in (self.truth, self._named)]
-        counts = np.zeros((len(index), len(index)), dtype=np.int64)
-        np.add.at(counts, tuple(cells), 1)
-        return counts
-
-    @property
-    def macro_f1(self) -> float:
-        """Mean F1 of the classes that are the truth of any run, equally weighted."""
-        true = self.confusion.sum(axis=1) > 0
-        return float(class_ratios(self.confusion)[true, 2].mean())
-
-    @cached_property
-    def nats(self) -> FloatArray:
-        """Log score of each run, (run,) [nats]; infinite where the truth has probability 0."""
-        return log_score(self.truth, self.posteriors)
-
-    @property
-    def log_score(self) -> float:
-        """Mean log score [nats per run]; may be infinite."""
-        return float(np.mean(self.nats))
-
-    @property
-    def brier(self) -> float:
-        """Mean Brier score, 0 to 2."""
-        return float(brier_score(self.truth, self.posteriors).mean())
-
-    @cached_property
-    def decided(self) -> tuple[FloatArray, BoolArray]:
-        """Stated probability of each verdict, and whether it is right, (verdict,) each."""
-        rows = zip(self.verdicts, self.posteriors, self.hits, strict=True)
-        pairs = [(p[verdict], hit) for verdict, p, hit in rows if verdict is not None]
-        stated, right = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
-        return np.minimum(stated, 1.0), right > 0.0  # sums may round above 1
-
-    @property
-    def coverage(self) -> list[Coverage]:
-        """Coverage of 90 % intervals by fault mode; empty where true values are unknown."""
-        return coverage_by_mode(self.cases)
-
-
-def class_ratios(confusion: IntArray) -> FloatArray:
-    """Return precision, recall and F1 of each class, (..., class, 3); 0 / 0 is NaN.
-
-    F1 = 2 hits / (runs + diagnoses). The confusion matrix holds counts (..., truth, diagnosis).
-    """
-    hits = np.diagonal(confusion, axis1=-2, axis2=-1)
-    runs, diagnoses = confusion.sum(axis=-1), confusion.sum(axis=-2)
-    with np.errstate(invalid="ignore"):
-        return np.stack([hits / diagnoses, hits / runs, 2 * hits / (runs + diagnoses)], axis=-1)
+# Proper scoring rules of probabilities.
 
 
 def log_score(truth: Sequence[str], posterior: Sequence[Mapping[str, float]]) -> FloatArray:
@@ -283,8 +245,9 @@ def brier_score(truth: Sequence[str], posterior: Sequence[Mapping[str, float]]) 
     0 is perfect, 2 is the worst (Brier, Monthly Weather Review 1950). A truth missing from its
     posterior adds 1.
     """
-    tables = [({t: 0.0, **p}, t) for p, t in zip(posterior, truth, strict=True)]
-    return np.array([sum((p - (name == t)) ** 2 for name, p in ps.items()) for ps, t in tables])
+    pairs = list(zip(posterior, truth, strict=True))
+    squares = [sum((c - (name == true)) ** 2 for name, c in p.items()) for p, true in pairs]
+    return np.array(squares) + [true not in p for p, true in pairs]
 
 
 # Reliability and calibration error.
@@ -340,10 +303,11 @@ def reliability(
     """
     if not confidence.size or not np.all((confidence >= 0.0) & (confidence <= 1.0)):
         raise InputError("expected the stated probability of at least one run, within 0 to 1.")
-    inside, bins = np.searchsorted(edges[1:-1], confidence), len(edges) - 1
+    inside, bins = np.searchsorted(edges[1:-1], confidence, side="left"), len(edges) - 1
     count = np.bincount(inside, minlength=bins)
-    with np.errstate(invalid="ignore"):
-        mean = np.bincount(inside, confidence, bins) / count
+    total = np.bincount(inside, weights=confidence, minlength=bins)
+    mean = np.full(bins, np.nan)
+    np.divide(total, count, out=mean, where=count > 0)
     return Reliability(edges, count, np.bincount(inside[right], minlength=bins), mean)
 
 
@@ -355,7 +319,8 @@ def calibrated_error(
     Answers are drawn from the stated probabilities, (run,) (consistency resampling: Broecker &
     Smith, Weather and Forecasting 2007).
     """
-    drawn = (rng.random(len(confidence)) < confidence for _ in range(draws))
+    runs = len(confidence)
+    drawn = (rng.random(runs) < confidence for _ in range(draws))
     return np.array([reliability(confidence, right).error for right in drawn])
 
 
@@ -368,27 +333,22 @@ BATCH = 100
 
 
 @dataclass(frozen=True)
-class Split:
-    """Numbers of runs of which a property, such as being right, holds for two methods."""
+class McNemar:
+    """Exact McNemar test (McNemar, Psychometrika 1947).
+
+    Attributes:
+        both: Runs that both methods got right.
+        first_only: Runs that only the first got right.
+        second_only: Runs that only the second got right.
+        neither: Runs that neither got right.
+        p: Two-sided binomial probability of a split at least as uneven.
+    """
 
     both: int
     first_only: int
     second_only: int
     neither: int
-
-    @classmethod
-    def of(cls, first: BoolArray, second: BoolArray) -> Split:
-        """Count runs by whether the property holds for each method, (run,) each."""
-        cells = (first & second, first & ~second, second & ~first, ~first & ~second)
-        return cls(*(int(cell.sum()) for cell in cells))
-
-    @property
-    def p(self) -> float:
-        """Exact McNemar test: two-sided binomial probability of a split at least as uneven."""
-        from scipy.stats import binomtest
-
-        differ = self.first_only + self.second_only
-        return float(binomtest(self.first_only, differ).pvalue) if differ else 1.0
+    p: float
 
 
 @dataclass(frozen=True)
@@ -401,37 +361,60 @@ class LogScoreGain:
         finite_mean: Mean over the runs whose truth both gave a probability; NaN if there are none.
         interval: 95 % bootstrap percentile interval of `finite_mean` (Efron 1979).
         runs: Runs behind `finite_mean`.
-        impossible: Runs whose truth has probability 0; where both gave it, there is no difference.
+        first_impossible: Runs whose truth only the first method gave probability 0.
+        second_impossible: The same for the second method.
+        both_impossible: Runs whose truth both gave probability 0; they count as no difference.
     """
 
     mean: float
     finite_mean: float
     interval: tuple[float, float]
     runs: int
-    impossible: Split
+    first_impossible: int
+    second_impossible: int
+    both_impossible: int
+
+
+def mcnemar(first: BoolArray, second: BoolArray) -> McNemar:
+    """Compare which of the same runs two methods got right, (run,) each."""
+    from scipy.stats import binomtest
+
+    cells = (first & second, first & ~second, second & ~first, ~first & ~second)
+    both, first_only, second_only, neither = (int(cell.sum()) for cell in cells)
+    differ = first_only + second_only
+    p = float(binomtest(first_only, differ).pvalue) if differ else 1.0
+    return McNemar(both, first_only, second_only, neither, p)
 
 
 def log_score_gain(
     first: FloatArray, second: FloatArray, rng: np.random.Generator, draws: int = RESAMPLES
 ) -> LogScoreGain:
     """Compare the log scores of two methods on the same runs, (run,) [nats]."""
+    lost_first, lost_second = np.isinf(first), np.isinf(second)
+    with np.errstate(invalid="ignore"):  # infinities of both signs have no mean
+        gain = np.where(lost_first & lost_second, 0.0, first - second)
+        mean = float(np.mean(gain))
+    finite = gain[~(lost_first | lost_second)]
+    return LogScoreGain(
+        mean=mean,
+        finite_mean=float(finite.mean()) if finite.size else float("nan"),
+        interval=_bootstrap_interval(finite, rng, draws),
+        runs=int(finite.size),
+        first_impossible=int((lost_first & ~lost_second).sum()),
+        second_impossible=int((lost_second & ~lost_first).sum()),
+        both_impossible=int((lost_first & lost_second).sum()),
+    )
+
+
+def _bootstrap_interval(
+    values: FloatArray, rng: np.random.Generator, draws: int
+) -> tuple[float, float]:
     from scipy.stats import bootstrap
 
-    impossible = np.isinf(first), np.isinf(second)
-    with np.errstate(invalid="ignore"):  # infinities of both signs have no mean
-        gain = np.where(impossible[0] & impossible[1], 0.0, first - second)
-        mean = float(np.mean(gain))
-    finite = gain[~(impossible[0] | impossible[1])]
-    middle = float(finite.mean()) if finite.size else math.nan
-    low = high = middle
-    if finite.size > 1:
-        low, high = bootstrap(
-            (finite,),
-            np.mean,
-            n_resamples=draws,
-            batch=BATCH,
-            method="percentile",
-            random_state=rng,
-        ).confidence_interval
-    interval = float(low), float(high)
-    return LogScoreGain(mean, middle, interval, int(finite.size), Split.of(*impossible))
+    if values.size < 2:
+        only = float(values[0]) if values.size else float("nan")
+        return only, only
+    found = bootstrap(
+        (values,), np.mean, n_resamples=draws, batch=BATCH, method="percentile", random_state=rng
+    ).confidence_interval
+    return float(found.low), float(found.high)

@@ -18,11 +18,13 @@ from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.core.runs import RunTable, concatenate
 from failuretwin.core.types import IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
+from failuretwin.decision.evaluation import Judged
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
 from failuretwin.decision.learned.feature_encoder import (
     FeatureEncoder,
     Floats,
     expectation_of,
+    signals_of,
 )
 from failuretwin.decision.learned.log_pool import HybridDiagnoser, fit_pool_weights
 from failuretwin.decision.learned.networks import Batch, Standard, epoch
@@ -113,7 +115,7 @@ class TrainingData:
 
         Chunks of different numbers share no runs; variants are equally frequent in each.
         """
-        made = [(at, encoder.encode(table)) for at, table in self._made(number, runs)]
+        made = [(at, encoder.encode(signals_of(table))) for at, table in self._made(number, runs)]
         order, features = (np.concatenate(parts) for parts in zip(*made, strict=True))
         shuffled = np.random.default_rng([self.seed, number, 1]).permutation(runs)
         return features[shuffled], self._classes(number, runs)[order[shuffled]]
@@ -350,7 +352,7 @@ def train_network(
     _calibrate(network, bayes, other.run_set(0, half))
     judges = other.run_set(1, half)
     both = HybridDiagnoser(bayes, network, network.weights_, class_name(bayes.twin.robot))
-    alone, pooled = (Scores.of(d.diagnose(judges)) for d in (network, both))
+    alone, pooled = (Judged.of(d.diagnose(judges)).scores for d in (network, both))
     return network, alone, pooled
 
 

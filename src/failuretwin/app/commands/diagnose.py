@@ -175,8 +175,8 @@ def diagnose(
     from failuretwin.app import inputs as given
     from failuretwin.app.reports import reports
     from failuretwin.app.reports.isolability_report import isolability_summary
+    from failuretwin.decision.evaluation import Judged
     from failuretwin.decision.robot_state import course_of, robot_state
-    from failuretwin.decision.scoring import Scores
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.inference.diagnoser import BayesDiagnoser
     from failuretwin.inference.faults.priors import priors_of
@@ -224,7 +224,7 @@ def diagnose(
     if method == given.BAYES and sensed == TOOL_ALONE:
         show(*isolability_summary(runs, found.bayes))
     show(*reports.state_lines(state, together=course is not None))
-    reports.print_scores(Scores.of(diagnoses))
+    reports.print_scores(Judged.of(diagnoses))
     last = [*reports.course_lines(course, state, known.robot), *found.lines]
     show(*([""] if last else []), *last)
 

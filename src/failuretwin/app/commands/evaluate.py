@@ -66,15 +66,15 @@ def evaluate(
     elif published_labels:
         raise InputError("--published-labels says how to read the truth. Add --truth RUNS.")
     first = read_results(results)
-    scores = evaluation.evaluate(first, truths)
+    scores = evaluation.evaluate(first, truths, np.random.default_rng(seed))
     comparison = None
     if against is not None:
         second = read_results(against)
         comparison = evaluation.compare(first, second, truths, np.random.default_rng(seed))
     if latex is not None:
-        write_latex(scores, comparison, latex, np.random.default_rng(seed))
+        write_latex(scores, comparison, latex)
     if report is not None:
         write_reliability(scores, report)
-    print_evaluation(scores, truth is not None, np.random.default_rng(seed))
+    print_evaluation(scores, truth is not None)
     if comparison is not None:
         print_comparison(comparison)

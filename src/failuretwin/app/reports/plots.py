@@ -17,7 +17,8 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import AXES, unique_names
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.store import filling
-from failuretwin.decision.scoring import Reliability, Scores, Share, reliability
+from failuretwin.decision.evaluation import Evaluation
+from failuretwin.decision.scoring import Reliability, Share
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.explanation import plain_name
 
@@ -181,15 +182,15 @@ NAME = "reliability.png"
 """Name of the picture in its folder."""
 
 
-def write_reliability(scores: Scores, folder: Path) -> None:
+def write_reliability(evaluation: Evaluation, folder: Path) -> None:
     """Write the picture into `folder`.
 
     Raises:
         InputError: If no run got a verdict, or matplotlib is missing.
     """
-    if not scores.decided[0].size:
+    if evaluation.calibration is None:
         raise InputError("no run got a verdict, so there is no reliability to draw.")
-    figure = reliability_figure(reliability(*scores.decided), scores.runs_and_protocol)
+    figure = reliability_figure(evaluation.calibration.equal, evaluation.runs_and_protocol)
     save_figure(figure, folder, NAME)
 
 

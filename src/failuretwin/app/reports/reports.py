@@ -11,10 +11,17 @@ import numpy as np
 from failuretwin.app.terminal import Table, figures_table, show
 from failuretwin.core.errors import counted
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.store import write_text
 from failuretwin.decision import scoring
-from failuretwin.decision.evaluation import Comparison, as_unknown_line, is_right, score_line
+from failuretwin.decision.evaluation import (
+    Calibration,
+    Comparison,
+    Evaluation,
+    Judged,
+    as_unknown_line,
+    is_right,
+    score_line,
+)
 from failuretwin.decision.robot_state import RobotState
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.explanation import joint_names_in
@@ -66,23 +73,24 @@ def course_lines(course: FaultCourse | None, state: RobotState, robot: Robot) ->
     return [*told, f"what to do: {state.step}"]
 
 
-def print_scores(scores: scoring.Scores) -> None:
+def print_scores(judged: Judged) -> None:
     """Print how good the diagnoses are, if the truth of any run is known."""
-    if not scores.runs:
+    if not judged.diagnoses:
         return
-    show(f"\n{score_line(scores)}")
-    if scores.as_unknown:
-        show(as_unknown_line(scores))
-    show("", class_table(scores), "", _confusion_table(scores))
+    show(f"\n{score_line(judged)}")
+    if judged.as_unknown:
+        show(as_unknown_line(judged))
+    show("", class_table(judged.scores), "", _confusion_table(judged.scores))
 
 
 def class_table(scores: scoring.Scores) -> Table:
     """Return precision, recall and F1 of each class."""
-    counts, ratios = scores.confusion.sum(axis=1), scoring.class_ratios(scores.confusion)
-    rows = zip(scores.classes, counts, ratios, strict=True)
     return figures_table(
         ("class", "runs", "precision", "recall", "F1"),
-        [(name, str(runs), *(f"{value:.3f}" for value in values)) for name, runs, values in rows],
+        [
+            (row.name, str(row.runs), *(f"{v:.3f}" for v in (row.precision, row.recall, row.f1)))
+            for row in scores.by_class()
+        ],
     )
 
 
@@ -100,34 +108,35 @@ def _confusion_table(scores: scoring.Scores) -> Table:
 # What `evaluate` adds.
 
 
-def print_evaluation(scores: scoring.Scores, truth_given: bool, rng: np.random.Generator) -> None:
+def print_evaluation(evaluation: Evaluation, truth_given: bool) -> None:
     """Print every score; without a run set given, no true onset or magnitude can be known."""
-    print_scores(scores)
-    show(f"\nall {scores.runs_and_protocol}", summary_table(scores, rng))
-    if scores.decided[0].size:
-        show("", _reliability_table(scoring.reliability(*scores.decided)))
-    if scores.coverage:
-        show("", coverage_table(scores.coverage))
+    print_scores(evaluation.judged)
+    show(f"\nall {evaluation.runs_and_protocol}", summary_table(evaluation))
+    if evaluation.calibration is not None:
+        show("", _reliability_table(evaluation.calibration.equal))
+    if evaluation.coverage:
+        show("", coverage_table(evaluation.coverage))
     elif truth_given:
         show("\ncoverage of intervals: the truth names no onset or magnitude of a fault found")
     else:
         show("\ncoverage of intervals: needs true onsets and magnitudes, give --truth RUNS")
 
 
-def summary_table(scores: scoring.Scores, rng: np.random.Generator) -> Table:
+def summary_table(evaluation: Evaluation) -> Table:
     """Return name and value of each score of all runs together."""
-    healthy, faulty = map(_abstained, scores.abstained)
+    scores, alarms = evaluation.scores, evaluation.alarms
+    false_alarms = _percent(alarms.false_alarms) + _abstained(alarms.healthy_abstained)
     rows = [
-        ("accuracy", _percent(scores.share)),
+        ("accuracy", _percent(scoring.Share(scores.right, scores.runs))),
         ("macro-F1", f"{scores.macro_f1:.3f}, mean over the classes that were true of any run"),
-        ("false-alarm rate", _percent(scores.false_alarms) + healthy),
-        ("missed-detection rate", _percent(scores.missed) + faulty),
+        ("false-alarm rate", false_alarms),
+        ("missed-detection rate", _percent(alarms.missed) + _abstained(alarms.faulty_abstained)),
         ("log score", f"{scores.log_score:.3f} nats a run"),
-        ("Brier score", f"{scores.brier:.3f} (0 is perfect, 2 the worst)"),
+        ("Brier score", f"{evaluation.brier:.3f} (0 is perfect, 2 the worst)"),
     ]
-    if scores.decided[0].size:
-        rows += _calibration_rows(*scores.decided, rng)
-    return Table(("Score", scores.runs_and_protocol), rows, header=False)
+    if evaluation.calibration is not None:
+        rows += _calibration_rows(evaluation.calibration)
+    return Table(("Score", evaluation.runs_and_protocol), rows, header=False)
 
 
 def _percent(share: scoring.Share) -> str:
@@ -145,12 +154,9 @@ def _abstained(count: int) -> str:
     return f", {count} without a verdict, which is no alarm" if count else ""
 
 
-def _calibration_rows(
-    stated: FloatArray, right: BoolArray, rng: np.random.Generator
-) -> list[tuple[str, str]]:
-    equal = scoring.reliability(stated, right)
-    adaptive = scoring.reliability(stated, right, scoring.adaptive_edges(stated))
-    typical, high = np.quantile(scoring.calibrated_error(stated, rng), [0.5, 0.95])
+def _calibration_rows(calibration: Calibration) -> list[tuple[str, str]]:
+    equal, adaptive = calibration.equal, calibration.adaptive
+    typical, high = np.quantile(calibration.by_chance, [0.5, 0.95])
     return [
         ("calibration error", f"{equal.error:.3f} in {len(equal.count)} bins of equal width"),
         ("  by chance alone", f"{typical:.3f}, in 1 of 20 cases above {high:.3f}"),
@@ -206,11 +212,10 @@ def comparison_rows(comparison: Comparison) -> list[tuple[str, str]]:
         unknown = f"by A {a} runs, by B {b}: their truth is not among its hypotheses"
         rows.append(("judged as unknown", unknown))
     gain = comparison.gain
-    none = gain.impossible
-    if gain.runs < comparison.runs:
+    if gain.first_impossible or gain.second_impossible or gain.both_impossible:
         impossible = (
-            f"only by A in {none.first_only} runs, only by B in {none.second_only}, by both in "
-            f"{none.both}"
+            f"only by A in {gain.first_impossible} runs, only by B in {gain.second_impossible}, by "
+            f"both in {gain.both_impossible}"
         )
         rows.append(("truth given no probability", impossible))
         rows.append(("log score, A minus B, all runs", f"{gain.mean:+.3f} nats a run"))
@@ -225,18 +230,16 @@ def comparison_rows(comparison: Comparison) -> list[tuple[str, str]]:
     return rows
 
 
-def write_latex(
-    scores: scoring.Scores, comparison: Comparison | None, path: Path, rng: np.random.Generator
-) -> None:
+def write_latex(evaluation: Evaluation, comparison: Comparison | None, path: Path) -> None:
     """Write all scores, those of each class, coverage and the comparison, as tables for a paper."""
-    summary, classes = summary_table(scores, rng), class_table(scores)
-    if count := sum(scores.as_unknown.values()):
+    summary, classes = summary_table(evaluation), class_table(evaluation.scores)
+    if count := sum(evaluation.judged.as_unknown.values()):
         unknown = f"{count} runs, whose truth is not among the hypotheses"
         summary = replace(summary, rows=[*summary.rows, ("judged as unknown", unknown)])
     dashes = [["--" if cell == "nan" else cell for cell in row] for row in classes.rows]
     tables = [summary, figures_table(("Class", "Runs", "Precision", "Recall", "F1"), dashes)]
-    if scores.coverage:
-        rows = [row[:4] for row in coverage_table(scores.coverage).rows]
+    if evaluation.coverage:
+        rows = [row[:4] for row in coverage_table(evaluation.coverage).rows]
         tables.append(figures_table(("90 % interval", "Runs", "Inside", "95 % interval"), rows))
     if comparison is not None:
         tables.append(Table(("Compared", "on the same runs"), comparison_rows(comparison)))

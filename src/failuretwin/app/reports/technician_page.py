@@ -18,9 +18,8 @@ from failuretwin.app.reports.plots import plain, plot_runs, render_page
 from failuretwin.app.terminal import Table
 from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, OPEN_STATE, Diagnosis
 from failuretwin.data_knowledge.store import filling
-from failuretwin.decision.evaluation import as_unknown_line, is_right, score_line
+from failuretwin.decision.evaluation import Judged, as_unknown_line, is_right, score_line
 from failuretwin.decision.robot_state import RobotState, state_of_run
-from failuretwin.decision.scoring import Scores
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.explanation import percent
@@ -150,7 +149,7 @@ def write_page(
             and the first ones are shown in full.
         sections: What else is told.
     """
-    scores = Scores.of(diagnoses)
+    judged = Judged.of(diagnoses)
     rows = _rows(diagnoses, pictures or dict.fromkeys(range(MOST_PICTURES)), robot)
     values: dict[str, Any] = {
         "state": state,
@@ -165,8 +164,8 @@ def write_page(
         "protocol": diagnoses[0].protocol,
         "version": __version__,
         "known": any(d.truth is not None for d in diagnoses),
-        "score": score_line(scores),
-        "as_unknown": as_unknown_line(scores),
+        "score": score_line(judged),
+        "as_unknown": as_unknown_line(judged),
         "plain": plain,
         "percent": percent,
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,23 +14,24 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils import check_random_state
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
-from torch import nn
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import check_motors, check_runs, truth_of
-from failuretwin.core.types import FloatArray, IntArray, as_floats
+from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.decision.learned.feature_encoder import (
     POINTS,
     SHARED,
     FeatureEncoder,
     Floats,
+    signals_of,
 )
 from failuretwin.decision.learned.log_pool import PoolWeights
 from failuretwin.decision.learned.networks import (
     Batch,
+    Pace,
     Shape,
     Standard,
     build_network,
@@ -65,7 +66,8 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         batch_runs: Runs in a batch.
         random_state: Seed of weights, dropout and order.
         classes_: The classes; sorted after `fit`.
-        network_: The trained network, behind the standardisation of each channel.
+        network_: The trained network.
+        standard_: Standardisation of each channel.
         temperature_: Divisor of the logits before softmax.
         movements_: Smallest and largest number of movements of the training runs; None: unknown.
         weights_: Weights in the pool with the Bayesian diagnosis; None: never fitted.
@@ -105,8 +107,11 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         features = _points(features)
         rng = check_random_state(self.random_state)
         order = np.random.default_rng(rng.randint(2**31))
-        batches = shuffled_batches(features, index.astype(np.int64), self.batch_runs, order)
-        self._learn(batches, Standard.of(features), names, rng.randint(2**31))
+        standard = Standard.of(features)
+        batches = shuffled_batches(
+            standard(features), index.astype(np.int64), self.batch_runs, order
+        )
+        self._learn(batches, standard, names, rng.randint(2**31))
         return self
 
     def fit_batches(
@@ -117,14 +122,15 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         movements: tuple[int, int],
         on_iteration: Callable[[int], None] = lambda done: None,
     ) -> LearnedDiagnoser:
-        """Train on batches, such as those of a `Stream`.
+        """Train on batches that are not standardised yet, such as those of a `Stream`.
 
         `movements` are the smallest and largest number of a run; `on_iteration` is called after
         each batch with the number of batches so far.
         """
         seed = check_random_state(self.random_state).randint(2**31)
         self.n_features_in_, self.movements_ = POINTS, movements
-        self._learn(batches, standard, np.array(classes), seed, on_iteration)
+        standardised = ((standard(features), index) for features, index in batches)
+        self._learn(standardised, standard, np.array(classes), seed, on_iteration)
         return self
 
     def _learn(
@@ -142,25 +148,15 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             )
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            network = self.untrained(standard, len(classes))
-            pace = self.iterations, self.learning_rate, self.decay
-            for done in training(network, batches, *pace):
+            network = build_network(
+                self.network, network_shape(self.encoder, len(standard.mean), len(classes))
+            )
+            pace = Pace(self.iterations, self.learning_rate, self.decay)
+            for done in training(network, batches, pace):
                 on_iteration(done)
         self.network_ = network.cpu()
-        self.classes_, self.temperature_ = classes, 1.0
+        self.classes_, self.standard_, self.temperature_ = classes, standard, 1.0
         self.weights_: PoolWeights | None = None
-
-    @property
-    def channels(self) -> int:
-        """Channels of each point that the network was trained on."""
-        return len(self.network_[0].state_dict()["mean"])
-
-    def untrained(self, standard: Standard, classes: int) -> nn.Sequential:
-        """Return a new network behind a standardisation, with random weights."""
-        shape = Shape(len(standard.mean), classes)
-        if self.encoder is not None and self.encoder.features == "robust":
-            shape = replace(shape, motors=len(self.encoder.robot.motors), shared=len(SHARED))
-        return nn.Sequential(standard, build_network(self.network, shape))
 
     def calibrate(self, X: Runs, y: ArrayLike | None = None) -> LearnedDiagnoser:
         """Set the temperature with the best mean log score on held-out runs; no test set.
@@ -186,15 +182,16 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def scores(self, X: Runs) -> FloatArray:
         """Return the logits, (run, class), before the temperature."""
         check_is_fitted(self, "network_")
-        features = _points(
-            validate_data(self, self._features(X), allow_nd=True, dtype=np.float32, reset=False)
+        features = validate_data(
+            self, self._features(X), allow_nd=True, dtype=np.float32, reset=False
         )
-        if features.shape[2] != self.channels:
+        features = _points(features)
+        if features.shape[2] != len(self.standard_.mean):
             raise InputError(
                 f"features have {features.shape[2]} channels, the network was trained on "
-                f"{self.channels}."
+                f"{len(self.standard_.mean)}."
             )
-        return scores_of(self.network_, features)
+        return scores_of(self.network_, self.standard_(features))
 
     def predict_proba(self, X: Runs) -> FloatArray:
         """Return the probability of each class, (run, class), in the order of `classes_`."""
@@ -278,7 +275,14 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return self.encoder
 
     def _features(self, X: Runs) -> Any:
-        return self._encoder().encode(X) if _is_run_set(X) else X
+        return self._encoder().encode(signals_of(X)) if _is_run_set(X) else X
+
+
+def network_shape(encoder: FeatureEncoder | None, channels: int, classes: int) -> Shape:
+    """Return the shape of a network for the features of an encoder."""
+    if encoder is None or encoder.features != "robust":
+        return Shape(channels, classes)
+    return Shape(channels, classes, len(encoder.robot.motors), len(SHARED))
 
 
 def _is_run_set(X: Runs) -> bool:
@@ -297,8 +301,8 @@ def _points(features: Floats) -> Floats:
 
 def movement_counts(runs: xr.Dataset) -> IntArray:
     """Return the number of movements of each run, (run,)."""
-    command, time = as_floats(runs["command"].values), as_floats(runs["time"].values)
-    return find_movements(command, time).exists.sum(axis=1)
+    signals = signals_of(runs)
+    return find_movements(signals.command, signals.time).exists.sum(axis=1)
 
 
 def probabilities(scores: FloatArray, temperature: float) -> FloatArray:

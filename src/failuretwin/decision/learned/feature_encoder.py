@@ -9,6 +9,7 @@ distance, both compressed by asinh. Points without a reading are zero and marked
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -141,35 +142,48 @@ def expectation_of(robot: Robot, imperfections: Imperfections) -> Expectation:
     return Expectation(imperfections.name, imperfections.protocol, lag, settling)
 
 
-def robust_features(robot: Robot, expected: Expectation, signals: Signals) -> FloatArray:
-    """Return residuals in motor space against the expected healthy arm, (run, point, channel)."""
-    index, seen = _points(signals)
-    run, known = np.arange(len(index))[:, None], seen[..., None]
-    pose = _healthy_pose(robot, expected, signals, index)
-    rotation, point = robot.chain.frames(pose * robot.sensor_sense)
-    origin, axis, tool = point[..., :-1, :], rotation[..., :-1, :, 2], point[..., -1, :]
-    measured = np.where(known, signals.measured[run, index], tool)
-    turn, misfit = _explained(origin, axis, tool, measured)
-    turn = turn * robot.sensor_sense
-    off = _compressed(measured - tool, DISTANCE_M) * known
-    turned, left = _compressed(turn, TURN_RAD), _compressed(misfit, DISTANCE_M)
-    per_motor = np.stack((turned * known, left * known, (pose + turn) * known, pose), axis=-1)
-    return np.concatenate([per_motor.reshape(*pose.shape[:2], -1), off, known], axis=-1)
+@dataclass(frozen=True)
+class RobustFeatures:
+    """Residuals in motor space against the expected healthy arm, at 100 points of a run."""
 
+    robot: Robot
+    expected: Expectation
 
-def _healthy_pose(
-    robot: Robot, expected: Expectation, signals: Signals, index: IntArray
-) -> FloatArray:
-    """Return the pose of a healthy arm at samples `index`, (run, point, motor) [rad]."""
-    command, lag = signals.command, np.asarray(expected.lag_s)
-    place = np.maximum(index[..., None] - lag / signals.step, 0.0)
-    low = place.astype(np.int64)
-    high = np.minimum(low + 1, command.shape[1] - 1)
-    run, motor = np.arange(len(index))[:, None, None], np.arange(command.shape[2])
-    before, after = command[run, low, motor], command[run, high, motor]
-    pose = before + (place - low) * (after - before)
-    direction = _direction(command)[run, low, motor]
-    return pose + expected.settling.offset(robot, pose, direction)
+    def __post_init__(self) -> None:
+        sliding = [joint.name for joint in self.robot.chain.joints if joint.prismatic]
+        if sliding:
+            raise InputError(
+                f"robust features know joints that turn, and {', '.join(sliding)} of "
+                f"{self.robot.name!r} slides. Use another method."
+            )
+
+    def __call__(self, signals: Signals) -> FloatArray:
+        """Return the features, (run, point, channel), of order one."""
+        index, seen = _points(signals)
+        run, known = np.arange(len(index))[:, None], seen[..., None]
+        pose = self._healthy_pose(signals, index)
+        rotation, point = self.robot.chain.frames(pose * self.robot.sensor_sense)
+        origin, axis, tool = point[..., :-1, :], rotation[..., :-1, :, 2], point[..., -1, :]
+        measured = np.where(known, signals.measured[run, index], tool)
+        turn, misfit = _explained(origin, axis, tool, measured)
+        turn = turn * self.robot.sensor_sense
+        off = _compressed(measured - tool, DISTANCE_M) * known
+        turned, left = _compressed(turn, TURN_RAD), _compressed(misfit, DISTANCE_M)
+        where = (turned * known, left * known, (pose + turn) * known, pose)
+        per_motor = np.stack(where, axis=-1)
+        return np.concatenate([per_motor.reshape(*pose.shape[:2], -1), off, known], axis=-1)
+
+    def _healthy_pose(self, signals: Signals, index: IntArray) -> FloatArray:
+        """Return the pose of a healthy arm at samples `index`, (run, point, motor) [rad]."""
+        command, lag = signals.command, np.asarray(self.expected.lag_s)
+        place = np.maximum(index[..., None] - lag / signals.step, 0.0)
+        low = place.astype(np.int64)
+        high = np.minimum(low + 1, command.shape[1] - 1)
+        run, motor = np.arange(len(index))[:, None, None], np.arange(command.shape[2])
+        before, after = command[run, low, motor], command[run, high, motor]
+        pose = before + (place - low) * (after - before)
+        direction = _direction(command)[run, low, motor]
+        return pose + self.expected.settling.offset(self.robot, pose, direction)
 
 
 def _points(signals: Signals) -> tuple[IntArray, FloatArray]:
@@ -232,9 +246,6 @@ class FeatureEncoder:
         features: One of `FEATURE_SETS`.
         robot: The robot.
         expected: Healthy behaviour for the robust features; None: that of the published twin.
-
-    Raises:
-        InputError: If there is no such feature set, or a joint slides, which `robust` cannot model.
     """
 
     features: str
@@ -244,28 +255,21 @@ class FeatureEncoder:
     def __post_init__(self) -> None:
         if self.features not in FEATURE_SETS:
             raise unknown_name("feature set", self.features, FEATURE_SETS)
-        sliding = [joint.name for joint in self.robot.chain.joints if joint.prismatic]
-        if sliding and self.features == "robust":
-            raise InputError(
-                f"robust features know joints that turn, and {', '.join(sliding)} of "
-                f"{self.robot.name!r} slides. Use another method."
-            )
 
     @property
     def protocol(self) -> str:
         """Protocol letter of the features."""
         return "P0" if self.expected is None else self.expected.protocol
 
-    @property
-    def reference(self) -> Expectation:
-        """Healthy behaviour that the robust features compare with."""
-        return self.expected or expectation_of(self.robot, NO_IMPERFECTIONS)
-
-    def encode(self, runs: xr.Dataset | RunTable) -> Floats:
+    def encode(self, signals: Signals) -> Floats:
         """Return features (run, point, channel)."""
-        signals = signals_of(runs)
         if self.features == "robust":
-            return robust_features(self.robot, self.reference, signals).astype(np.float32)
+            return self._robust(signals).astype(np.float32)
         if self.features == "original":
             return original_features(signals).astype(np.float32)
         return augmented_features(DigitalTwin(self.robot), signals).astype(np.float32)
+
+    @cached_property
+    def _robust(self) -> RobustFeatures:
+        expected = self.expected or expectation_of(self.robot, NO_IMPERFECTIONS)
+        return RobustFeatures(self.robot, expected)

@@ -1,7 +1,6 @@
 """The networks and their training loop: the paper's LSTM, a CNN, and a motor-wise CNN.
 
-Each maps standardised features (run, point, channel) to logits (run, class). A trained network is
-the sequence of a `Standard` and one of them.
+Each maps standardised features (run, point, channel) to logits (run, class).
 """
 
 from __future__ import annotations
@@ -12,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.optim.lr_scheduler import LambdaLR
 
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray, IntArray
@@ -46,35 +45,6 @@ class Shape:
     classes: int
     motors: int = 1
     shared: int = 0
-
-
-class Standard(nn.Module):
-    """Standardisation of each channel to zero mean and unit variance.
-
-    Attributes:
-        mean: (channel,).
-        spread: Standard deviation, (channel,); 1 for a constant channel.
-    """
-
-    mean: Tensor
-    spread: Tensor
-
-    def __init__(self, mean: Floats, spread: Floats) -> None:
-        super().__init__()
-        self.register_buffer("mean", torch.from_numpy(mean))
-        self.register_buffer("spread", torch.from_numpy(spread))
-
-    @classmethod
-    def of(cls, features: Floats) -> Standard:
-        """Return the standardisation fitted to features (run, point, channel)."""
-        flat = features.reshape(-1, features.shape[-1]).astype(np.float64)
-        spread = flat.std(axis=0)
-        spread[spread < 1e-12] = 1.0
-        return cls(flat.mean(axis=0).astype(np.float32), spread.astype(np.float32))
-
-    def forward(self, features: Tensor) -> Tensor:
-        """Return standardised features."""
-        return (features - self.mean) / self.spread
 
 
 class PaperLstm(nn.Module):
@@ -192,10 +162,30 @@ def build_network(name: str, shape: Shape) -> nn.Module:
 # Training loop.
 
 Batch = tuple[Floats, IntArray]
-"""Features (run, point, channel) and classes (run,)."""
+"""Standardised features (run, point, channel) and classes (run,)."""
 
 EVALUATED_RUNS = 512
 """Runs evaluated at a time."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Settings of Adam with cross-entropy loss.
+
+    Attributes:
+        iterations: Number of batches.
+        learning_rate: Initial learning rate.
+        decay: Whether the rate falls to zero along half a cosine.
+    """
+
+    iterations: int
+    learning_rate: float = 1e-3
+    decay: bool = False
+
+    def rate(self, done: int) -> float:
+        """Return the learning rate after some iterations."""
+        share = 0.5 * (1.0 + math.cos(math.pi * done / self.iterations)) if self.decay else 1.0
+        return self.learning_rate * share
 
 
 def device() -> torch.device:
@@ -203,39 +193,25 @@ def device() -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def half_cosine(share: float) -> float:
-    """Return the factor on the learning rate after a share of the iterations, 1 to 0."""
-    return 0.5 * (1.0 + math.cos(math.pi * share))
+def training(network: nn.Module, batches: Iterable[Batch], pace: Pace) -> Iterator[int]:
+    """Train a network in place; yield the number of iterations after each.
 
-
-def training(
-    network: nn.Module,
-    batches: Iterable[Batch],
-    iterations: int,
-    learning_rate: float = 1e-3,
-    decay: bool = False,
-) -> Iterator[int]:
-    """Train a network in place by Adam with cross-entropy loss; yield the iterations after each.
-
-    Args:
-        network: Maps features to logits.
-        batches: At least as many as there are iterations.
-        iterations: Number of batches.
-        learning_rate: Initial learning rate.
-        decay: Whether the rate falls to zero along half a cosine.
+    Needs at least as many batches as `pace` has iterations.
     """
     where = device()
     network.to(where)
-    optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate)
-    rate = LambdaLR(optimizer, lambda done: half_cosine(done / iterations) if decay else 1.0)
+    optimizer = torch.optim.Adam(network.parameters(), lr=pace.learning_rate)
     measure = nn.CrossEntropyLoss()
-    for done, (features, classes) in zip(range(iterations), batches, strict=False):
+    source = iter(batches)
+    for done in range(pace.iterations):
+        features, classes = next(source)
+        optimizer.param_groups[0]["lr"] = pace.rate(done)
         network.train()
         optimizer.zero_grad()
         scores = network(torch.from_numpy(features).to(where))
-        measure(scores, torch.from_numpy(classes).to(where)).backward()
+        loss = measure(scores, torch.from_numpy(classes).to(where))
+        loss.backward()
         optimizer.step()
-        rate.step()
         yield done + 1
 
 
@@ -267,3 +243,28 @@ def epoch(
     for first in range(0, len(order) - size + 1, size):
         chosen = order[first : first + size]
         yield features[chosen], classes[chosen]
+
+
+@dataclass(frozen=True)
+class Standard:
+    """Standardisation of each channel to zero mean and unit variance.
+
+    Attributes:
+        mean: (channel,).
+        spread: Standard deviation, (channel,); 1 for a constant channel.
+    """
+
+    mean: NDArray[np.float32]
+    spread: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, features: Floats) -> Standard:
+        """Return the standardisation fitted to features (run, point, channel)."""
+        flat = features.reshape(-1, features.shape[-1]).astype(np.float64)
+        spread = flat.std(axis=0)
+        spread[spread < 1e-12] = 1.0
+        return cls(flat.mean(axis=0).astype(np.float32), spread.astype(np.float32))
+
+    def __call__(self, features: Floats) -> Floats:
+        """Return standardised features."""
+        return (features - self.mean) / self.spread

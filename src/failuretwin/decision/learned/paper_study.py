@@ -31,7 +31,7 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import SUFFIXES, replacing, write_text
 from failuretwin.decision.evaluation import Truths
-from failuretwin.decision.learned.feature_encoder import FeatureEncoder
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, signals_of
 from failuretwin.decision.scoring import class_ratios
 from failuretwin.digital_model.robot import Robot
 
@@ -160,7 +160,7 @@ def make_arrays(plan: StudyPlan, robot: Robot, test: Exam, folder: Path) -> None
         encoder = FeatureEncoder(features, robot)
         arrays: dict[str, Any] = {}
         for name, runs in (("simulated", simulated), ("test", test.runs)):
-            arrays[name] = encoder.encode(runs)
+            arrays[name] = encoder.encode(signals_of(runs))
             arrays[f"{name}_class"] = [names.index(fault) for fault in truth_of(runs) or []]
         with replacing(folder / f"{features}.npz") as new, new.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
@@ -242,15 +242,15 @@ def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
 
     start = time.perf_counter()
     rng = np.random.default_rng([plan.seed, job.repeat])
-    sets = _split(folder / f"{job.features}.npz", rng)
-    standard = networks.Standard.of(sets["training"][0])
+    sets = _standardised_sets(folder / f"{job.features}.npz", rng)
+    channels = sets["test"][0].shape[2]
     torch.manual_seed(int(rng.integers(2**31)))
-    shape = networks.Shape(len(standard.mean), classes)
-    network = torch.nn.Sequential(standard, networks.build_network("lstm", shape))
+    network = networks.build_network("lstm", networks.Shape(channels, classes))
     batches = networks.shuffled_batches(*sets["training"], BATCH_RUNS, rng)
     accuracies: dict[str, tuple[float, ...]] = dict.fromkeys(sets, ())
     confusion = np.zeros((classes, classes), dtype=np.int64)
-    for iteration in networks.training(network, batches, plan.iterations, job.learning_rate):
+    pace = networks.Pace(plan.iterations, job.learning_rate)
+    for iteration in networks.training(network, batches, pace):
         if iteration in plan.checkpoints:
             for name, (features, truth) in sets.items():
                 diagnosis = networks.scores_of(network, features).argmax(axis=1)
@@ -262,17 +262,21 @@ def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
     write_text(json.dumps(asdict(result), indent=1), _file(folder, job))
 
 
-def _split(path: Path, rng: np.random.Generator) -> dict[str, tuple[Any, Any]]:
+def _standardised_sets(path: Path, rng: np.random.Generator) -> dict[str, tuple[Any, Any]]:
     """Return features and classes of the `training`, `validation` and `test` runs."""
+    from failuretwin.decision.learned.networks import Standard
+
     with np.load(path, allow_pickle=False) as stored:
         simulated, truth = stored["simulated"], stored["simulated_class"]
         test = stored["test"], stored["test_class"]
     order = rng.permutation(len(simulated))
-    validation, training = np.split(order, [round(VALIDATION_SHARE * len(order))])
+    held_out = round(VALIDATION_SHARE * len(order))
+    validation, learning = order[:held_out], order[held_out:]
+    standard = Standard.of(simulated[learning])
     return {
-        "training": (simulated[training], truth[training]),
-        "validation": (simulated[validation], truth[validation]),
-        "test": test,
+        "training": (standard(simulated[learning]), truth[learning]),
+        "validation": (standard(simulated[validation]), truth[validation]),
+        "test": (standard(test[0]), test[1]),
     }
 
 
@@ -374,10 +378,11 @@ def run_study(
 
 def _manifest(plan: StudyPlan, robot: Robot, test: Exam) -> dict[str, Any]:
     """Return everything that determines the figures of the study."""
-    sizes = asdict(plan) | {"checkpoints": list(plan.checkpoints)}
-    del sizes["stand_in_runs"]  # part of the test set
     return {
-        **sizes,
+        "seed": plan.seed,
+        "runs_per_class": plan.runs_per_class,
+        "checkpoints": list(plan.checkpoints),
+        "repeats": plan.repeats,
         "robot": fingerprint(robot),
         "test": test.source,
         "test_sha256": _digest(test),

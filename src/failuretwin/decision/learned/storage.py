@@ -27,7 +27,7 @@ from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.foreign import reading
 from failuretwin.data_knowledge.readers.file_claims import check_npz
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
+from failuretwin.decision.learned.diagnoser import LearnedDiagnoser, network_shape
 from failuretwin.decision.learned.feature_encoder import (
     DAMPING_M,
     DISTANCE_M,
@@ -35,16 +35,17 @@ from failuretwin.decision.learned.feature_encoder import (
     TURN_RAD,
     Expectation,
     FeatureEncoder,
+    expectation_of,
 )
 from failuretwin.decision.learned.log_pool import PoolWeights
-from failuretwin.decision.learned.networks import STRIDES, Standard
+from failuretwin.decision.learned.networks import STRIDES, Standard, build_network
 from failuretwin.digital_model.kinematics import GRAVITY
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.digital_model.robot import Robot, load_robot
 
 FORMAT = 1
 SUFFIX = ".npz"
-WEIGHT = "weight/"
-"""Prefix of the names of weights in a file."""
+_WEIGHT = "weight/"
 _NOT_ARGUMENTS = ("encoder", "network")
 """Arguments of the estimator with their own place in the file."""
 Arrays = dict[str, NDArray[Any]]
@@ -66,16 +67,17 @@ def save_network(diagnoser: LearnedDiagnoser, path: str | Path) -> None:
     path = Path(path)
     check_network_file(path)
     configuration = json.dumps(_configuration(diagnoser)).encode()
-    arrays = {"configuration": np.frombuffer(configuration, dtype=np.uint8), **_arrays(diagnoser)}
+    arrays: Arrays = {
+        "configuration": np.frombuffer(configuration, dtype=np.uint8),
+        **vars(diagnoser.standard_),
+        **{_WEIGHT + name: array for name, array in _weights(diagnoser).items()},
+    }
     with replacing(path) as partial, partial.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
 
 
-def _arrays(diagnoser: LearnedDiagnoser, prefix: str = WEIGHT) -> Arrays:
-    """Return `mean`, `spread` and the weights of a network, these with a prefix."""
-    standard, network = (part.state_dict() for part in diagnoser.network_)
-    tensors = standard | {prefix + name: tensor for name, tensor in network.items()}
-    return {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
+def _weights(diagnoser: LearnedDiagnoser) -> Arrays:
+    return {name: tensor.cpu().numpy() for name, tensor in diagnoser.network_.state_dict().items()}
 
 
 def _configuration(diagnoser: LearnedDiagnoser) -> dict[str, Any]:
@@ -122,8 +124,7 @@ def load_network(path: str | Path, robot: Robot | None = None) -> LearnedDiagnos
         check_npz(path)
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
-        configuration = json.loads(arrays.pop("configuration").tobytes())
-        return _restored(configuration, arrays, robot, path)
+        return _restored(json.loads(arrays["configuration"].tobytes()), arrays, robot, path)
 
 
 def _restored(
@@ -136,35 +137,36 @@ def _restored(
             f"{configuration['versions'].get('failuretwin')}."
         )
     encoder = _restored_encoder(configuration["encoder"], robot, path)
+    _check_numbers(arrays, float(configuration["temperature"]))
     arguments = configuration["arguments"]
     known = set(LearnedDiagnoser().get_params(deep=False)) - set(_NOT_ARGUMENTS)
     if set(arguments) != known:
         raise KeyError(f"arguments {sorted(set(arguments) ^ known)}")
     diagnoser = LearnedDiagnoser(configuration["network"], encoder, **arguments)
+    diagnoser.standard_ = Standard(arrays["mean"], arrays["spread"])
     diagnoser.classes_ = np.array(configuration["classes"])
     diagnoser.temperature_ = float(configuration["temperature"])
-    diagnoser.n_features_in_ = configuration["features_in"]
     movements, pool = configuration["movements"], configuration["weights"]
     diagnoser.movements_ = movements and (int(movements[0]), int(movements[1]))
     diagnoser.weights_ = pool and from_table(PoolWeights, pool, f"{path}: weights")
-    standard = Standard(arrays.pop("mean"), arrays.pop("spread"))
-    diagnoser.network_ = diagnoser.untrained(standard, len(diagnoser.classes_))
-    named = [name for name in arrays if name.startswith(WEIGHT)]
-    weights = {name.removeprefix(WEIGHT): torch.from_numpy(arrays[name]) for name in named}
-    diagnoser.network_[1].load_state_dict(weights)
-    _check_numbers(diagnoser)
+    shape = network_shape(encoder, len(diagnoser.standard_.mean), len(diagnoser.classes_))
+    network = build_network(configuration["network"], shape)
+    weights = {n.removeprefix(_WEIGHT): a for n, a in arrays.items() if n.startswith(_WEIGHT)}
+    network.load_state_dict({name: torch.from_numpy(array) for name, array in weights.items()})
+    diagnoser.network_ = network
+    diagnoser.n_features_in_ = configuration["features_in"]
     return diagnoser
 
 
-def _check_numbers(diagnoser: LearnedDiagnoser) -> None:
+def _check_numbers(arrays: Arrays, temperature: float) -> None:
     """Raise ValueError unless all numbers of a network are valid."""
-    if not all(tensor.isfinite().all() for tensor in diagnoser.network_.state_dict().values()):
+    numbers = [value for value in arrays.values() if np.issubdtype(value.dtype, np.floating)]
+    if not all(np.isfinite(value).all() for value in numbers):
         raise ValueError("a weight is not finite")
-    mean, spread = (tensor.shape for tensor in diagnoser.network_[0].buffers())
-    if mean != spread:
+    if arrays["mean"].shape != arrays["spread"].shape:
         raise ValueError("mean and spread differ in length")
-    if not 0.0 < diagnoser.temperature_ < np.inf:
-        raise ValueError(f"temperature {diagnoser.temperature_:g}")
+    if not 0.0 < temperature < np.inf:
+        raise ValueError(f"temperature {temperature:g}")
 
 
 def _restored_encoder(
@@ -195,10 +197,12 @@ class _Classifier(nn.Module):
     def __init__(self, diagnoser: LearnedDiagnoser) -> None:
         super().__init__()
         self.network, self.temperature = diagnoser.network_, diagnoser.temperature_
+        self.mean, self.spread = (torch.from_numpy(a) for a in vars(diagnoser.standard_).values())
 
     def forward(self, features: Tensor) -> Tensor:
         """Return probabilities (run, class)."""
-        return torch.softmax(self.network(features) / self.temperature, dim=1)
+        scores = self.network((features - self.mean) / self.spread)
+        return torch.softmax(scores / self.temperature, dim=1)
 
 
 def export_onnx(diagnoser: LearnedDiagnoser, path: Path) -> None:
@@ -213,7 +217,7 @@ def export_onnx(diagnoser: LearnedDiagnoser, path: Path) -> None:
     """
     with needs_extra("ONNX files need onnxscript", "learn"):
         import onnxscript  # noqa: F401
-    features = torch.zeros(2, POINTS, diagnoser.channels)
+    features = torch.zeros(2, POINTS, len(diagnoser.standard_.mean))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # from inside the exporter
         program = torch.onnx.export(
@@ -243,19 +247,19 @@ def export_numpy(diagnoser: LearnedDiagnoser, path: Path) -> None:
         raise InputError(f"{path}: cannot be imported. Expected a name such as diagnoser.py.")
     if diagnoser.encoder is None:
         raise InputError("this network has no encoder, so it cannot read runs.")
-    network = diagnoser.network_[1]
+    shape = network_shape(diagnoser.encoder, len(diagnoser.standard_.mean), 0)
     settings = {
         "classes": [str(name) for name in diagnoser.classes_],
         "features": diagnoser.encoder.features,
         "network": diagnoser.network,
         "points": POINTS,
         "strides": STRIDES,
-        "motors": getattr(network, "motors", 1),
-        "shared": getattr(network, "shared", 0),
+        "motors": shape.motors,
+        "shared": shape.shared,
         "temperature": float(diagnoser.temperature_),
     }
     buffer = BytesIO()
-    arrays = _feature_constants(diagnoser.encoder) | _arrays(diagnoser, prefix="")
+    arrays = _feature_constants(diagnoser.encoder) | vars(diagnoser.standard_) | _weights(diagnoser)
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     packed = textwrap.fill(base64.b64encode(buffer.getvalue()).decode("ascii"), 96)
     text = (files("failuretwin.decision.learned") / "standalone.py.txt").read_text("utf-8")
@@ -272,7 +276,8 @@ def export_numpy(diagnoser: LearnedDiagnoser, path: Path) -> None:
 
 def _feature_constants(encoder: FeatureEncoder) -> Arrays:
     """Return the constants of the robot and its healthy behavior that features depend on."""
-    robot, expected = encoder.robot, encoder.reference
+    robot = encoder.robot
+    expected = encoder.expected or expectation_of(robot, NO_IMPERFECTIONS)
     settling = expected.settling
     numbers: dict[str, Any] = {
         "joints": [joint.T_pj for joint in robot.chain.joints],
