@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -59,6 +60,10 @@ def figures_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title:
     return Table(headings, list(rows), "l" + "r" * (len(headings) - 1), title)
 
 
+Part = str | Table
+"""A sentence or a table of a report."""
+
+
 def console() -> Console:
     """Return the console that everything is printed on; brackets and colons are as they are."""
     from rich.console import Console
@@ -69,7 +74,7 @@ def console() -> Console:
     return plain
 
 
-def show(*parts: str | Table) -> None:
+def show(*parts: Part) -> None:
     """Print sentences, which no width cuts, and tables; text of files only as text."""
     out = console()
     for part in parts:
@@ -90,6 +95,27 @@ def _on_terminal(table: Table) -> TerminalTable:
     for row in table.rows:
         drawn.add_row(*map(printable, row))
     return drawn
+
+
+def write_json(records: Iterable[Mapping[str, Any]], path: Path | None) -> None:
+    """Write JSON objects, one a line; None: nothing is written.
+
+    Raises:
+        OutputError: If they cannot be written.
+    """
+    from failuretwin.data_knowledge.store import write_records
+
+    if path is not None:
+        write_records(records, path)
+
+
+@contextmanager
+def until_interrupted() -> Iterator[None]:
+    """End what is inside on Ctrl-C, and say so."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        tell("stopped")
 
 
 # Progress of long work: a bar on a terminal, now and then a line elsewhere.

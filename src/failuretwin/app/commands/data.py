@@ -9,18 +9,20 @@ from typing import TYPE_CHECKING
 
 import click
 
+import failuretwin as ft
 from failuretwin.app.commands.options import (
     PATH,
     LogOptions,
-    RenamedOption,
-    common_options,
+    RobotOptions,
+    calibrated_robot_options,
     gathered,
     hypotheses_option,
     plugin_option,
     reading_options,
+    robot_options,
 )
-from failuretwin.app.terminal import progress_bar, tell
-from failuretwin.core.errors import counted
+from failuretwin.app.terminal import progress_bar, show, tell
+from failuretwin.core.errors import InputError, counted
 
 if TYPE_CHECKING:
     from failuretwin.digital_model.urdf.report import UrdfReport
@@ -32,37 +34,26 @@ if TYPE_CHECKING:
     "--out",
     required=True,
     type=PATH,
-    help="What to write: a run set (.nc, .zarr), a published layout (.mat: one file of cells, no "
-    "ending for a folder of pairs), or .csv.",
+    help="Output: a run set (.nc, .zarr), a published layout (.mat: one file of cells, no ending "
+    "for a folder of pairs), or .csv.",
 )
 @reading_options
-@common_options
-def import_(
-    sources: tuple[Path, ...],
-    out: Path,
-    reading: LogOptions,
-    robot: str,
-    seed: int,
-) -> None:
+@robot_options
+def import_(sources: tuple[Path, ...], out: Path, reading: LogOptions, robot: RobotOptions) -> None:
     """Read logs and write them as one run set.
 
     SRC is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
     downwards), such a file (.mat), a bag (.bag, .mcap), a LeRobot data set (a folder), an RTDE
     recording, or a CSV file, with --columns where its column names do not tell enough.
     """
-    del seed  # nothing here is drawn by chance
     from failuretwin.app.inputs import read_inputs
-    from failuretwin.core.errors import InputError
     from failuretwin.data_knowledge.readers.matlab import check_export_suffix, export_runs
-    from failuretwin.digital_model.robot import load_robot
-    from failuretwin.digital_model.twin import DigitalTwin
 
     check_export_suffix(out)
     if out.resolve() in [source.resolve() for source in sources]:
         raise InputError(f"{out}: is what is to be read. Give another name to write to.")
-    model = load_robot(robot)
-    runs = read_inputs(sources, model, reading)
-    export_runs(runs, out, DigitalTwin(model))
+    runs = read_inputs(sources, robot.model, reading)
+    export_runs(runs, out, ft.DigitalTwin(robot.model))
     tell(f"{counted(runs.sizes['run'], 'run')} written to {out}")
 
 
@@ -81,34 +72,25 @@ def import_(
     "Hypotheses to simulate, such as healthy,motor_2:stuck. Default: the paper's nine classes."
 )
 @click.option(
-    "--calibration",
-    "--imperfections",
-    cls=RenamedOption,
-    default="none",
-    metavar="none|NAME|FILE",
-    help="What the robot does that its twin does not: nothing, what is known of the robot of that "
-    "name, or a TOML file.",
-)
-@click.option(
     "--engine",
     type=click.Choice(["servo", "physics"]),
     default="servo",
-    help="What moves the robot: the published servo loops, or rigid-body physics (MuJoCo) with "
-    "gears that stick and joints that flex.",
+    help="servo: the published servo loops. physics: rigid bodies (MuJoCo) with friction in the "
+    "gears and flexible joints.",
 )
 @click.option(
     "--sensors",
     metavar="KIND,...",
-    help="Sensors to simulate beside that of the tool's position, as the profile has them: "
-    "accelerometer, gyroscope, orientation, wire.",
+    help="Sensors of the profile to simulate in addition to the tool's position: accelerometer, "
+    "gyroscope, orientation, wire.",
 )
 @click.option(
     "--faults",
     type=PATH,
     metavar="FILE",
-    help="How large faults are, when they begin and how they grow: a TOML file with a table for "
-    "each mode, such as [drift]. Default: the paper's stuck and steady_state_error; the other "
-    "modes as assumed in docs/fault_modes.md.",
+    help="Size, onset and growth of faults: a TOML file with a table for each mode, such as "
+    "[drift]. Default: the paper's stuck and steady_state_error; the other modes as assumed in "
+    "docs/fault_modes.md.",
 )
 @click.option(
     "--workers",
@@ -123,19 +105,17 @@ def import_(
     "share the folder of --out.",
 )
 @plugin_option
-@common_options
+@calibrated_robot_options("none")
 def simulate(
     out: Path,
     runs_per_class: int,
     hypotheses: str | None,
-    calibration: str,
     engine: str,
     sensors: str | None,
     faults: Path | None,
     workers: int,
     scheduler: str | None,
-    robot: str,
-    seed: int,
+    robot: RobotOptions,
 ) -> None:
     """Make labelled runs with the digital twin and write them as a run set.
 
@@ -143,24 +123,21 @@ def simulate(
     with what is missing. Up to a few thousand can be written to .nc.
     """
     from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
-    from failuretwin.data_knowledge.generate import Plan
     from failuretwin.data_knowledge.resumable import produce
     from failuretwin.data_knowledge.store import check_destination
     from failuretwin.data_knowledge.workers import Workforce
-    from failuretwin.digital_model.calibrated_robot import load_calibration
-    from failuretwin.digital_model.robot import load_robot
     from failuretwin.failure_behavior.registry import MODES, load_modes
 
     check_destination(out)
-    known = load_calibration(calibration, load_robot(robot))
+    known = robot.known
     names = known.robot.motor_names
-    plan = Plan(
+    plan = ft.Plan(
         robot=known.robot,
         hypotheses=paper_hypotheses(names)
         if hypotheses is None
         else parse_hypotheses(hypotheses.split(","), names),
         runs_per_class=runs_per_class,
-        seed=seed,
+        seed=robot.seed,
         imperfections=known.imperfections,
         engine=engine,
         sensors=[] if sensors is None else [kind.strip() for kind in sensors.split(",")],
@@ -205,7 +182,6 @@ urdf_options = gathered(
         "--sensor-noise",
         type=click.FloatRange(min=0.0),
         default=0.5,
-        show_default=True,
         metavar="MM",
         help="Noise of the tool sensor on each axis [mm]; joints that move the tool by less for "
         "each radian are left out.",
@@ -227,11 +203,11 @@ def robot() -> None:
 @robot.command()
 @urdf_options
 def check(urdf: UrdfOptions) -> None:
-    """Say whether a URDF can be used, which motors move the tool, and what is missing."""
-    from failuretwin.app.reports.robot_report import print_urdf
+    """Report whether a URDF can be used, which motors move the tool, and what is missing."""
+    from failuretwin.app.reports.robot_report import urdf_parts
 
     report = urdf.report()
-    print_urdf(report)
+    show(*urdf_parts(report))
     report.raise_errors()
 
 
@@ -265,8 +241,6 @@ def _check_profile(out: Path, replaced: Path | None = None) -> None:
     Raises:
         InputError: If it does not end in .toml, or another file has this name.
     """
-    from failuretwin.core.errors import InputError
-
     if out.suffix != ".toml":
         raise InputError(f"{out}: a profile ends in .toml. Give such a name.")
     if out.exists() and (replaced is None or out.resolve() != replaced.resolve()):
@@ -276,17 +250,14 @@ def _check_profile(out: Path, replaced: Path | None = None) -> None:
 def _write_profile(text: str, out: Path) -> None:
     """Write a profile that `load_robot` accepts; otherwise nothing is written."""
     from failuretwin.data_knowledge.store import replacing
-    from failuretwin.digital_model.robot import load_robot
 
     with replacing(out) as partial:
         partial.write_text(text, encoding="utf-8")
-        load_robot(partial)
+        ft.load_robot(partial)
 
 
 def _home(text: str | None, report: UrdfReport) -> list[float]:
     """Return the angles at rest that the user gives [rad or m]; empty where none are given."""
-    from failuretwin.core.errors import InputError
-
     if text is None:
         return []
     try:
@@ -307,28 +278,26 @@ def _home(text: str | None, report: UrdfReport) -> list[float]:
 @click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG...")
 @click.option("--out", required=True, type=PATH, metavar="PROFILE", help="Profile to write: .toml.")
 @reading_options
-@common_options
-def fit_(logs: tuple[Path, ...], out: Path, reading: LogOptions, robot: str, seed: int) -> None:
+@robot_options
+def fit_(logs: tuple[Path, ...], out: Path, reading: LogOptions, robot: RobotOptions) -> None:
     """Find frames, tool point, senses, zeros and geometry from poses in which a healthy arm rests.
 
-    LOG is whatever `diagnose` reads. Writes the profile of --robot with what was found, its remarks
-    kept. Forty poses all over the range tell the frames, hundreds the geometry.
+    LOG is any input of `diagnose`. The profile of --robot is written with the fitted values, its
+    remarks kept. Forty poses all over the range tell the frames, hundreds the geometry.
     """
-    del seed  # nothing here depends on chance
     from datetime import UTC, datetime
 
     from failuretwin.app.inputs import read_inputs
-    from failuretwin.app.reports.robot_report import print_registration
+    from failuretwin.app.reports.robot_report import registration_parts
     from failuretwin.connection.registration.fit import fit_registration
     from failuretwin.digital_model.profile_text import fitted_text
-    from failuretwin.digital_model.robot import load_robot
 
-    model = load_robot(robot)
+    model = robot.model
     _check_profile(out, model.source)
     runs = read_inputs(logs, model, reading)
     names = ", ".join(log.name for log in logs)
     found = fit_registration(runs, model, names, datetime.now(UTC).date().isoformat())
     text = fitted_text(model.source.read_text(encoding="utf-8"), model.source, out, found.profile)
     _write_profile(text, out)
-    print_registration(found)
+    show(*registration_parts(found))
     tell(f"written to {out}; use it with --robot {out}")

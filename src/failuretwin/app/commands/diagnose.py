@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+import failuretwin as ft
 from failuretwin.app.commands.options import (
     PATH,
     LogOptions,
-    calibration_option,
-    common_options,
+    RobotOptions,
+    calibrated_robot_options,
     hypotheses_option,
     json_option,
     plugin_option,
@@ -22,6 +23,7 @@ from failuretwin.app.commands.options import (
     report_option,
 )
 from failuretwin.app.terminal import progress_bar, show, tell
+from failuretwin.core.errors import InputError, counted
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -29,12 +31,7 @@ if TYPE_CHECKING:
     from failuretwin.connection.life_history import History
     from failuretwin.connection.self_calibration import SelfCalibration
     from failuretwin.connection.tracked_diagnosis import Tracked
-    from failuretwin.core.hypothesis import Diagnosis
-    from failuretwin.decision.robot_state import RobotState
-    from failuretwin.digital_model.twin import DigitalTwin
-    from failuretwin.inference.diagnoser import BayesDiagnoser
     from failuretwin.inference.faults.priors import Priors
-    from failuretwin.inference.together.fault_course import FaultCourse
 
 
 BAYES_ONLY = (
@@ -57,8 +54,8 @@ class Findings:
         tracked: Result of --track; None: not asked for.
     """
 
-    diagnoses: Sequence[Diagnosis]
-    bayes: BayesDiagnoser
+    diagnoses: Sequence[ft.Diagnosis]
+    bayes: ft.BayesDiagnoser
     learned: SelfCalibration | None = None
     tracked: Tracked | None = None
 
@@ -78,39 +75,37 @@ class Findings:
 
 @click.command()
 @click.argument("inputs", nargs=-1, required=True, type=PATH, metavar="INPUT...")
-@calibration_option
 @click.option(
     "--method",
     default="bayes",
     metavar="bayes|MODEL|bayes+MODEL|module:Class",
-    help="How to diagnose: by Bayes' rule, by a network that `train` wrote, by both, or by a class "
-    "of your own.",
+    help="Method of diagnosis: Bayes' rule, a network that `train` wrote, both, or your own class.",
 )
 @click.option(
     "--track",
     is_flag=True,
     help="Judge each run by what those before it teach of the robot, and go on learning. Give runs "
-    "in their order, the oldest first. Without --calibration it begins with what such arms are "
-    "like. What is known is kept beside the calibration, or beside --out (FILE.history.jsonl).",
+    "in their order, the oldest first. Without --calibration it begins with the arm class. The "
+    "history is kept beside the calibration, or beside --out (FILE.history.jsonl).",
 )
 @click.option(
     "--self-calibrate",
     is_flag=True,
-    help="Let the runs, all of one robot, say together how it differs from others of its kind: no "
-    "healthy logs are needed. With --calibration FILE, how it differs from that.",
+    help="Learn from all runs together, all of one robot, how it differs from others of its kind "
+    "or from --calibration FILE. No healthy logs are needed.",
 )
 @click.option(
     "--independent",
     is_flag=True,
-    help="With --track or --self-calibrate: what was wrong in one run says nothing of the next, as "
-    "in a set of experiments. Default: faults stay until repaired, and the runs, in their order, "
-    "get one verdict beside their own.",
+    help="With --track or --self-calibrate: faults of one run say nothing of the next, as in a set "
+    "of experiments. Default: faults stay until repaired, and the runs, in their order, get one "
+    "verdict in addition to their own.",
 )
 @click.option(
     "--out",
     type=PATH,
     metavar="FILE",
-    help="Where to write the calibration that --self-calibrate learns, or --track that began cold.",
+    help="Calibration to write: learned by --self-calibrate, or by --track without --calibration.",
 )
 @hypotheses_option(
     "Hypotheses to consider, at least two: healthy, MOTOR:MODE, two of these joined by '+', or "
@@ -134,20 +129,17 @@ class Findings:
 @click.option(
     "--sensing",
     metavar="SENSOR+...",
-    help="What to believe: tool (its position), orientation, accelerometer, gyroscope, wire, "
+    help="Sensors to use: tool (its position), orientation, accelerometer, gyroscope, wire, "
     "encoders, or several joined by '+'. Default: tool where runs have it, else what they have.",
 )
 @json_option("Write one object a run, one a line.")
 @click.option("--csv", "csv_file", type=PATH, help="Write a table, a row a run.")
-@report_option(
-    "Write index.html: the state of the robot, what to do, and pictures of some runs.", "--plot"
-)
+@report_option("Write index.html: the state of the robot, what to do, and pictures of some runs.")
 @reading_options
 @plugin_option
-@common_options
+@calibrated_robot_options()
 def diagnose(
     inputs: tuple[Path, ...],
-    calibration: Path | None,
     method: str,
     track: bool,
     self_calibrate: bool,
@@ -162,8 +154,7 @@ def diagnose(
     csv_file: Path | None,
     report: Path | None,
     reading: LogOptions,
-    robot: str,
-    seed: int,
+    robot: RobotOptions,
 ) -> None:
     """Diagnose runs from commands and tool path alone, or what other sensors saw (--sensing).
 
@@ -171,19 +162,18 @@ def diagnose(
     downwards), such a file (.mat), a bag (.bag, .mcap), a LeRobot data set (a folder), an RTDE
     recording, or a CSV file, with --columns where its column names do not tell enough.
     """
-    del seed  # the diagnosis draws nothing at random
     from failuretwin.app import inputs as given
     from failuretwin.app.reports import reports
+    from failuretwin.app.reports.calibration_report import taught_section
     from failuretwin.app.reports.isolability_report import isolability_summary
-    from failuretwin.decision.evaluation import Judged
+    from failuretwin.app.reports.technician_page import write_report
+    from failuretwin.decision.results import write_csv, write_json_lines
     from failuretwin.decision.robot_state import course_of, robot_state
-    from failuretwin.digital_model.calibrated_robot import load_calibration
-    from failuretwin.inference.diagnoser import BayesDiagnoser
     from failuretwin.inference.faults.priors import priors_of
     from failuretwin.inference.observation.sensors import TOOL_ALONE, sensing_of
 
-    known = load_calibration(calibration, robot)
-    bayes = BayesDiagnoser(
+    known, calibration = robot.known, robot.calibration
+    bayes = ft.BayesDiagnoser(
         known.twin,
         imperfections=known.imperfections,
         hypotheses=given.parse_cli_hypotheses(hypotheses, known.robot),
@@ -194,42 +184,67 @@ def diagnose(
         refuse_unused("only the Bayesian diagnosis has these options", *BAYES_ONLY)
     diagnoser = given.chosen_diagnoser(method, bayes)
     together = track or self_calibrate
-    _check_together(calibration, track and self_calibrate, track, out)
-    if not together:
-        refuse_unused("nothing is learned without --track or --self-calibrate", *LEARNING)
+    _check_together(calibration, track, self_calibrate, out)
     history = _history(bayes, calibration, out) if track else None
     runs = given.read_inputs(inputs, known.robot, reading)
     sensed = sensing_of(runs, sensing)
     given.warn_mismatch(runs, given.expected_name(diagnoser))
-    if together:
-        _check_tool(sensed)
-        found = (
-            _self_calibrate(runs, bayes, calibration, out)
-            if history is None
-            else _track(runs, bayes, history)
-        )
-    else:
-        found = Findings(diagnoser.diagnose(runs), bayes)
+    found = (
+        _learn(runs, bayes, sensed, history, calibration, out)
+        if together
+        else Findings(diagnoser.diagnose(runs), bayes)
+    )
     diagnoses = given.with_doubts(found.diagnoses, runs, known.twin)
     if (sse_range or error_range) and diagnoser is bayes:
         usual = priors_of(known.robot, None, onset)
         _tell_ruled_out(runs, found.bayes, diagnoses, usual)
     course = course_of(diagnoses, found.bayes) if together and not independent else None
     state = robot_state(diagnoses, known.robot, course, found.remarks if together else None)
-    _write_files(diagnoses, course, json_file, csv_file)
+    if json_file is not None:
+        write_json_lines(diagnoses, json_file, course)
+    if csv_file is not None:
+        write_csv(diagnoses, csv_file, course)
     if report is not None:
-        _write_page(runs, diagnoses, known.twin, state, found.learned, report)
+        sections = [taught_section(found.learned, known.robot)] if found.learned else []
+        write_report(runs, diagnoses, known.twin, state, report, sections)
+        tell(f"the page: {report / 'index.html'}", err=True)
     _keep(found.tracked, runs, out)
-    reports.print_diagnoses(diagnoses)
+    show(*reports.diagnosis_parts(diagnoses))
     if method == given.BAYES and sensed == TOOL_ALONE:
         show(*isolability_summary(runs, found.bayes))
     show(*reports.state_lines(state, together=course is not None))
-    reports.print_scores(Judged.of(diagnoses))
+    show(*reports.score_parts(diagnoses))
     last = [*reports.course_lines(course, state, known.robot), *found.lines]
     show(*([""] if last else []), *last)
 
 
-def _track(runs: xr.Dataset, bayes: BayesDiagnoser, history: History) -> Findings:
+def _learn(
+    runs: xr.Dataset,
+    bayes: ft.BayesDiagnoser,
+    sensed: tuple[str, ...],
+    history: History | None,
+    calibration: Path | None,
+    out: Path | None,
+) -> Findings:
+    """Return diagnoses that learn the robot, run by run if there is a history, else from all runs.
+
+    Raises:
+        InputError: If the runs do not show the tool's position.
+    """
+    from failuretwin.inference.observation.sensors import TOOL_ALONE
+
+    if sensed != TOOL_ALONE:
+        raise InputError(
+            f"the runs hold no tool position, but only what {' and '.join(sensed)} read. --track "
+            "and --self-calibrate learn from the tool's position: leave them out, or give logs "
+            "with one."
+        )
+    if history is None:
+        return _self_calibrate(runs, bayes, calibration, out)
+    return _track(runs, bayes, history)
+
+
+def _track(runs: xr.Dataset, bayes: ft.BayesDiagnoser, history: History) -> Findings:
     """Return diagnoses that learn the robot run by run; `history` holds its earlier runs."""
     from failuretwin.connection.tracked_diagnosis import diagnose_tracked
 
@@ -239,7 +254,7 @@ def _track(runs: xr.Dataset, bayes: BayesDiagnoser, history: History) -> Finding
 
 
 def _self_calibrate(
-    runs: xr.Dataset, bayes: BayesDiagnoser, calibration: Path | None, out: Path | None
+    runs: xr.Dataset, bayes: ft.BayesDiagnoser, calibration: Path | None, out: Path | None
 ) -> Findings:
     """Return diagnoses that learn the robot from all runs at once.
 
@@ -249,38 +264,24 @@ def _self_calibrate(
         calibration: Calibration to start from; None: that of the kind of arm.
         out: File for the learned calibration; None: not written.
     """
-    from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
-    from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
+    from failuretwin.connection.calibration.result import check_calibration_file
     from failuretwin.inference.together.folder_posterior import PASSES
 
     robot = bayes.twin.robot
     if out is not None:
         check_calibration_file(out)
-    together = SelfCalibratingDiagnoser(robot, calibration, bayes.hypotheses, bayes.priors)
+    together = ft.SelfCalibratingDiagnoser(robot, calibration, bayes.hypotheses, bayes.priors)
     with progress_bar("self-calibrating", PASSES) as advance:
         learned = together.learn(runs, advance)
     if out is not None:
-        save_calibration(learned.calibration, robot, out)
+        ft.save_calibration(learned.calibration, robot, out)
     known = learned.calibration.imperfections
-    calibrated = type(bayes)(together.twin, known, bayes.hypotheses, bayes.priors)
+    calibrated = ft.BayesDiagnoser(together.twin, known, bayes.hypotheses, bayes.priors)
     return Findings(learned.diagnoses, calibrated, learned=learned)
 
 
-def _check_tool(sensing: tuple[str, ...]) -> None:
-    """Refuse to weigh runs together that do not show the tool's position."""
-    from failuretwin.core.errors import InputError
-    from failuretwin.inference.observation.sensors import TOOL_ALONE
-
-    if sensing != TOOL_ALONE:
-        raise InputError(
-            f"the runs hold no tool position, but only what {' and '.join(sensing)} read. --track "
-            "and --self-calibrate learn from the tool's position: leave them out, or give logs "
-            "with one."
-        )
-
-
 def _tell_ruled_out(
-    runs: xr.Dataset, bayes: BayesDiagnoser, diagnoses: Sequence[Diagnosis], usual: Priors
+    runs: xr.Dataset, bayes: ft.BayesDiagnoser, diagnoses: Sequence[ft.Diagnosis], usual: Priors
 ) -> None:
     """Tell where runs show errors of a size that the user has ruled out.
 
@@ -290,9 +291,6 @@ def _tell_ruled_out(
         diagnoses: Of each run.
         usual: Beliefs without that range.
     """
-    from dataclasses import replace
-
-    from failuretwin.core.errors import counted
     from failuretwin.inference.explanation import joint_names_in
 
     free = replace(bayes, priors=usual).diagnose(runs)
@@ -313,26 +311,24 @@ def _tell_ruled_out(
 
 
 SURE = 0.9
-"""Probability from which a run that looks otherwise is told."""
+"""Probability from which a run that would look otherwise is reported."""
 
 
-def _check_together(calibration: Path | None, both: bool, track: bool, out: Path | None) -> None:
-    """Refuse ways of learning from runs that contradict each other.
-
-    Raises:
-        InputError: If they do.
-    """
-    from failuretwin.core.errors import InputError
-
-    if both:
+def _check_together(
+    calibration: Path | None, track: bool, all_runs: bool, out: Path | None
+) -> None:
+    """Raise InputError if ways of learning from runs contradict each other, or none is chosen."""
+    if track and all_runs:
         raise InputError(
             "--track judges each run by those before it, --self-calibrate by all. Choose one."
         )
     if out is not None and track and _is_file(calibration):
         raise InputError(
             "--track keeps what it learns beside the calibration that it began with. Leave out "
-            "--out, or --calibration to begin with what the kind of arm is like."
+            "--out, or --calibration to begin with the arm class."
         )
+    if not (track or all_runs):
+        refuse_unused("nothing is learned without --track or --self-calibrate", *LEARNING)
 
 
 def _is_file(calibration: Path | None) -> bool:
@@ -342,7 +338,7 @@ def _is_file(calibration: Path | None) -> bool:
     return calibration is not None and calibration != Path(GENERIC)
 
 
-def _history(bayes: BayesDiagnoser, calibration: Path | None, out: Path | None) -> History:
+def _history(bayes: ft.BayesDiagnoser, calibration: Path | None, out: Path | None) -> History:
     """Return what has been seen of a robot before; nothing is kept where no file is named."""
     from failuretwin.connection.calibration.result import check_calibration_file
     from failuretwin.connection.life_history import History, open_history
@@ -357,47 +353,14 @@ def _history(bayes: BayesDiagnoser, calibration: Path | None, out: Path | None) 
 
 def _keep(tracked: Tracked | None, runs: xr.Dataset, out: Path | None) -> None:
     """Keep what was learned of the runs; nothing was where they were not tracked."""
-    from failuretwin.connection.calibration.result import save_calibration
     from failuretwin.connection.life_history import keep_history
     from failuretwin.connection.tracked_diagnosis import calibration_of
 
     if tracked is None:
         return
     if out is not None:
-        save_calibration(calibration_of(tracked.life, runs), tracked.life.model.twin.robot, out)
+        ft.save_calibration(calibration_of(tracked.life, runs), tracked.life.model.twin.robot, out)
     keep_history(tracked.history, tracked.life, tracked.rows)
-
-
-def _write_files(
-    diagnoses: Sequence[Diagnosis],
-    course: FaultCourse | None,
-    json_file: Path | None,
-    csv_file: Path | None,
-) -> None:
-    """Write results to the files that were asked for."""
-    from failuretwin.decision.results import write_csv, write_json_lines
-
-    if json_file is not None:
-        write_json_lines(diagnoses, json_file, course)
-    if csv_file is not None:
-        write_csv(diagnoses, csv_file, course)
-
-
-def _write_page(
-    runs: xr.Dataset,
-    diagnoses: Sequence[Diagnosis],
-    twin: DigitalTwin,
-    state: RobotState,
-    learned: SelfCalibration | None,
-    folder: Path,
-) -> None:
-    """Write the technician's page, with what was learned where runs were weighed together."""
-    from failuretwin.app.reports.calibration_report import taught_section
-    from failuretwin.app.reports.technician_page import write_report
-
-    sections = [] if learned is None else [taught_section(learned, twin.robot)]
-    write_report(runs, diagnoses, twin, state, folder, sections)
-    tell(f"the page: {folder / 'index.html'}", err=True)
 
 
 @click.command()
@@ -407,8 +370,6 @@ def demo(report: Path | None) -> None:
 
     One is healthy, one has a stuck motor, one a motor that misses its targets.
     """
-    from failuretwin.data_knowledge.readers.read import sample_log
-
-    words = [str(sample_log()), *([] if report is None else ["--report", str(report)])]
+    words = [str(ft.sample_log()), *([] if report is None else ["--report", str(report)])]
     tell(f"failuretwin diagnose {' '.join(words)}\n")
     diagnose.main(words, prog_name="failuretwin diagnose", standalone_mode=False)

@@ -1,9 +1,8 @@
-"""Options that several commands share: logs, live robots, and the arm that is moved."""
+"""Options that several commands share: robots, logs, live robots, and the arm that is moved."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
@@ -12,10 +11,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from click.core import ParameterSource
 
+import failuretwin as ft
+from failuretwin.core.errors import InputError
+
 if TYPE_CHECKING:
     from failuretwin.decision.acting.safety import SafetyGate
     from failuretwin.decision.test_motions.probing import ProbeRules
-    from failuretwin.digital_model.robot import Robot
+    from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -30,7 +32,8 @@ def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F],
     def decorate(command: F) -> F:
         @wraps(command)
         def with_one(**told: Any) -> Any:
-            own = {field.name: told.pop(field.name) for field in fields(kind)}
+            names = [field.name for field in fields(kind) if field.name in told]
+            own = {option: told.pop(option) for option in names}
             return command(**told, **{name: kind(**own)})
 
         decorated: Any = with_one
@@ -51,8 +54,6 @@ def refuse_unused(why: str, *names: str) -> None:
     Raises:
         InputError: If one was given.
     """
-    from failuretwin.core.errors import InputError
-
     context = click.get_current_context()
     given = [
         option.opts[0]
@@ -64,45 +65,62 @@ def refuse_unused(why: str, *names: str) -> None:
         raise InputError(f"{why}: leave out {' and '.join(given)}.")
 
 
-def common_options(command: F) -> F:
-    """Add `--robot` and `--seed`, which every verb has."""
-    command = click.option(
-        "--seed",
-        type=click.IntRange(min=0),
-        default=0,
-        help="Seed of whatever is drawn by chance.",
-    )(command)
-    return click.option(
+@dataclass(frozen=True)
+class RobotOptions:
+    """Values of `robot_options`: the robot, its calibration, and the seed of random draws."""
+
+    robot: str
+    seed: int
+    calibration: Path | None = None
+
+    @property
+    def model(self) -> ft.Robot:
+        """The robot of the profile.
+
+        Raises:
+            InputError: If there is no such robot.
+        """
+        return ft.load_robot(self.robot)
+
+    @property
+    def known(self) -> CalibratedRobot:
+        """The robot with its servo loops and healthy behaviour.
+
+        Raises:
+            InputError: If there is no such robot or calibration.
+        """
+        return ft.load_calibration(self.calibration, self.robot)
+
+
+_robot_and_seed = (
+    click.option(
         "--robot",
         default="armpi_fpv",
         metavar="NAME|PROFILE",
         help="A bundled robot, or the TOML profile of another.",
-    )(command)
-
-
-calibration_option = click.option(
-    "--calibration",
-    type=PATH,
-    metavar="FILE",
-    help="What `calibrate` learned of this robot. Default: the calibration its profile names.",
+    ),
+    click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of random draws."),
 )
+robot_options = gathered(RobotOptions, "robot", *_robot_and_seed)
 
 
-class RenamedOption(click.Option):
-    """An option whose last name is an old one: it works, and the help leaves it out."""
-
-    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
-        """Return the name of the option and its help."""
-        shown = copy(self)
-        shown.opts = self.opts[:1]
-        return click.Option.get_help_record(shown, ctx)
-
-
-def report_option(text: str, *old_names: str) -> Callable[[F], F]:
-    """Return the option `--report DIR`."""
-    return click.option(
-        "--report", *old_names, cls=RenamedOption, type=PATH, metavar="DIR", help=text
+def calibrated_robot_options(default: str | None = None) -> Callable[[F], F]:
+    """Return `robot_options` with `--calibration`; None: as the robot's profile says."""
+    unless = "" if default else " Default: the calibration that the profile names."
+    calibration = click.option(
+        "--calibration",
+        type=PATH,
+        default=default,
+        metavar="FILE|NAME|generic|none",
+        help="Healthy behaviour of the robot: a file that `calibrate` wrote, the name of a bundled "
+        f"one, generic (that of its arm class) or none (that of the ideal twin).{unless}",
     )
+    return gathered(RobotOptions, "robot", calibration, *_robot_and_seed)
+
+
+def report_option(text: str) -> Callable[[F], F]:
+    """Return the option `--report DIR`."""
+    return click.option("--report", type=PATH, metavar="DIR", help=text)
 
 
 class HypothesesOption(click.Option):
@@ -256,15 +274,10 @@ def move_option(when: str = "") -> Callable[[F], F]:
     )
 
 
-floor_option = click.option(
-    "--floor", type=float, metavar="METRES", help="Height of the floor. Default: the base."
-)
-radius_option = click.option(
-    "--radius",
-    type=click.FloatRange(min=0.0),
-    metavar="METRES",
-    help="Radius of the links, for the distance that they keep. Default: by the arm's reach.",
-)
+def place_option(default: str) -> Callable[[F], F]:
+    """Return the option `--on`, the arm that takes orders: emulated by default, or a real one."""
+    kinds = f"{EMULATED}|" * (default == EMULATED) + "ros1|ros2|rosbridge://HOST[:PORT]"
+    return click.option("--on", "place", default=default, metavar=kinds, help="The arm.")
 
 
 @dataclass(frozen=True)
@@ -280,13 +293,7 @@ class ArmOptions:
 arm_options = gathered(
     ArmOptions,
     "arm",
-    click.option(
-        "--on",
-        "place",
-        default=EMULATED,
-        metavar="emulated|ros1|ros2|rosbridge://HOST[:PORT]",
-        help="The arm.",
-    ),
+    place_option(EMULATED),
     fault_option,
     move_option(),
     topics_option,
@@ -301,7 +308,7 @@ class SafetyOptions:
     floor: float | None = None
     radius: float | None = None
 
-    def gate(self, robot: Robot) -> SafetyGate:
+    def gate(self, robot: ft.Robot) -> SafetyGate:
         """Return the gate that every order passes."""
         from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
 
@@ -335,21 +342,32 @@ probe_options = gathered(
         type=click.IntRange(min=0),
         default=0,
         metavar="N",
-        help="While a fault is suspected and the arm stands still, make N movements at most that "
-        "settle which, each with the way back. Default: 0, nothing moves.",
+        help="Maximum number of diagnostic movements, each with the way back, while a fault is "
+        "suspected and the arm stands still. Default: 0, nothing moves.",
     ),
     click.option(
         "--idle",
         type=click.FloatRange(min=1.0),
         default=10.0,
-        show_default=True,
         metavar="SECONDS",
-        help="With --probe: only so long after the last command of others was carried out.",
+        help="With --probe: minimum time after the last command of others was carried out.",
     ),
     move_option("With --probe: "),
 )
 
 
+_space = (
+    click.option(
+        "--floor", type=float, metavar="METRES", help="Height of the floor. Default: the base."
+    ),
+    click.option(
+        "--radius",
+        type=click.FloatRange(min=0.0),
+        metavar="METRES",
+        help="Radius of the links, for the distance that they keep. Default: by the arm's reach.",
+    ),
+)
+space_options = gathered(SafetyOptions, "safety", *_space)
 safety_options = gathered(
     SafetyOptions,
     "safety",
@@ -359,6 +377,5 @@ safety_options = gathered(
         default=SPEED_SHARE,
         help="Share of each motor's speed limit that may be used.",
     ),
-    floor_option,
-    radius_option,
+    *_space,
 )

@@ -9,7 +9,6 @@ import numpy as np
 
 from failuretwin.app.reports.plots import BLUE, GREY, RED, clean, new_figure
 from failuretwin.connection.calibration.cross_validation import ExampleTransient, Predictions
-from failuretwin.connection.calibration.result import HeldOut
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot, shown_unit
@@ -139,22 +138,3 @@ def ramp_figure(ramp: ExampleTransient, robot: Robot) -> Figure:
         panel.plot(ramp.time, reading, ".", color="black", ms=6, label="readings")
     what = "angle" if ramp.of_motors else "position"
     return _finish(figure, panels, "time since the command [s]", f"{what} [{unit}]")
-
-
-def session_figure(held_out: Sequence[HeldOut], robot: Robot, of_motors: bool) -> Figure:
-    """Return the size of the settled error of each unseen session, before and after."""
-    names, scale, unit = channels(robot, of_motors)
-    figure = new_figure(WIDTH_IN, max(1.9, 0.34 * len(held_out) + 1.2))
-    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
-    rows = np.arange(len(held_out))[::-1]
-    before, after = (
-        scale * np.array([getattr(e, n) for e in held_out]) for n in ("before", "after")
-    )
-    for k, (panel, name) in enumerate(zip(panels, names, strict=True)):
-        panel.barh(rows + 0.19, before[:, k], 0.36, color=GREY, label="uncalibrated")
-        panel.barh(rows - 0.19, after[:, k], 0.36, color=BLUE, label="calibrated")
-        panel.set_title(name)
-        panel.set_yticks(rows, [entry.session for entry in held_out], fontsize=8)
-        panel.tick_params(axis="y", length=0)
-        panel.set_ylim(-0.6, len(held_out) - 0.4)
-    return _finish(figure, panels, f"settled error [{unit}]")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,11 +20,10 @@ from failuretwin.app.reports.calibration_pictures import (
     load_figure,
     quantile_figure,
     ramp_figure,
-    session_figure,
 )
 from failuretwin.app.reports.plots import png, render_page
 from failuretwin.app.reports.technician_page import Section
-from failuretwin.app.terminal import Table, figures_table, show
+from failuretwin.app.terminal import Part, Table, figures_table
 from failuretwin.connection.calibration.cross_validation import (
     example_transient,
     predict,
@@ -34,7 +32,6 @@ from failuretwin.connection.calibration.cross_validation import (
 from failuretwin.connection.calibration.result import Calibration, Parameter, mean_gain
 from failuretwin.connection.self_calibration import SelfCalibration
 from failuretwin.connection.tracked_diagnosis import Tracked
-from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.store import filling
 from failuretwin.digital_model.robot import Robot, shown_unit
 from failuretwin.inference.explanation import joint_names_in
@@ -44,53 +41,73 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def print_calibration(found: Calibration, robot: Robot) -> None:
-    """Print everything that was learned and how far it can be trusted."""
+def calibration_parts(found: Calibration, robot: Robot) -> list[Part]:
+    """Return everything that was learned and how far it can be trusted."""
     way = "motor readings" if found.used_readings else "the tool path alone"
-    show(f"{robot.name}: {found.movements} settled movements of {found.runs} runs, {way}\n")
-    show(parameter_table(found.parameters, robot))
-    show(*(f"  {_title(p)}: {p.note}" for p in found.parameters if not p.identified))
-    show(*(f"  {remark}" for remark in found.remarks))
+    parts: list[Part] = [
+        f"{robot.name}: {found.movements} settled movements of {found.runs} runs, {way}\n",
+        parameter_table(found.parameters, robot),
+        *(f"  {remark}" for remark in found.remarks),
+    ]
     if found.left_out:
-        show(f"\nleft out: {left_out_line(found)}")
+        parts.append(f"\nleft out: {left_out_line(found)}")
     if found.held_out:
-        show("\nsessions predicted by what the others say (settled error)\n")
-        show(held_out_table(found, robot))
-    show(f"\n{verdict_line(found)}")
+        parts.append("\nsessions predicted by what the others say (settled error)\n")
+        parts.append(held_out_table(found, robot))
+    return [*parts, f"\n{verdict_line(found)}"]
 
 
-def print_population(found: Calibration, robot: Robot) -> None:
-    """Print what the robots of a fleet are like and what they differ by."""
-    show(f"{robot.name}: {found.imperfections.name}: {', '.join(found.sessions)}\n")
-    show(parameter_table(found.parameters, robot, "95 % of such robots"))
-    show(*(f"  {_title(p)}: {p.note}" for p in found.parameters if not p.identified))
+def population_parts(found: Calibration, robot: Robot) -> list[Part]:
+    """Return the mean and spread of a fleet's parameters."""
+    head = f"{robot.name}: {found.imperfections.name}: {', '.join(found.sessions)}\n"
+    return [head, parameter_table(found.parameters, robot, "95 % of such robots")]
 
 
 def parameter_table(
-    parameters: Sequence[Parameter], robot: Robot, interval: str = "95 % interval"
+    parameters: Sequence[Parameter], robot: Robot | None, interval: str = "95 % interval"
 ) -> Table:
-    """Return a row for each figure: value, interval, unit, and how far it lies from such robots.
+    """Return a row for each parameter: value, interval, unit, deviations from such robots, note.
 
     Args:
-        parameters: The figures.
-        robot: The robot, for the units that people read.
-        interval: What the interval is of.
+        parameters: The parameters.
+        robot: The robot, whose servo counts are shown; None: angles are shown in degrees.
+        interval: Heading of the interval.
     """
-    beside = any(p.deviations is not None for p in parameters)
+    compared = any(p.deviations is not None for p in parameters)
     rows = []
     for p in parameters:
-        scale, unit = shown_unit(p.unit, robot, p.motor)
-        value, low, high = (f"{scale * x:.4g}" for x in (p.value, p.low, p.high))
+        scale, unit = _unit(p, robot)
+        value, low, high = (
+            figure(scale * x, scale * (p.high - p.low)) for x in (p.value, p.low, p.high)
+        )
+        title = f"{p.name}, {p.motor}" if p.motor else p.name
         off = "" if p.deviations is None else f"{p.deviations + 0.0:+.1f} deviations"
-        known = "" if p.identified else "not identified"
-        own = (_title(p), value, f"{low} to {high}", unit)
-        rows.append((*own, *[off] * beside, known))
-    headings = ("parameter", "value", interval, "unit", *["from such robots"] * beside, "")
+        note = "" if p.identified else f"not identified: {p.note}"
+        rows.append((title, value, f"{low} to {high}", unit, *[off] * compared, note))
+    headings = ("parameter", "value", interval, "unit", *["from such robots"] * compared, "")
     return Table(headings, rows)
 
 
-def _title(parameter: Parameter) -> str:
-    return f"{parameter.name}, {parameter.motor}" if parameter.motor else parameter.name
+SHORT_S = 0.2
+"""Times below this are shown in milliseconds [s]."""
+
+
+def _unit(p: Parameter, robot: Robot | None) -> tuple[float, str]:
+    """Return factor and name of the unit in which a parameter is shown."""
+    shown = {"share": (100.0, "%"), "m": (1e3, "mm"), "-": (1.0, "")}
+    if p.unit == "s" and max(abs(p.low), abs(p.high)) < SHORT_S:
+        return 1e3, "ms"
+    if p.unit == "rad" and robot is None:
+        return float(np.rad2deg(1.0)), "deg"
+    return shown.get(p.unit) or (shown_unit(p.unit, robot, p.motor) if robot else (1.0, p.unit))
+
+
+def figure(value: float, width: float) -> str:
+    """Return a value with as many digits as an interval of this width leaves meaning."""
+    if width <= 0.0 or not np.isfinite(width):
+        return f"{value:.3g}"
+    decimals = int(np.clip(1 - np.floor(np.log10(width / 2.0)), 0, 6))
+    return f"{value + 0.0:.{decimals}f}"
 
 
 def held_out_table(found: Calibration, robot: Robot) -> Table:
@@ -135,7 +152,7 @@ def verdict_line(found: Calibration) -> str:
     )
 
 
-# The rows of a calibration page: figures rounded as far as they are known, and interval bars.
+# The page.
 
 MEANING = {
     "bias": "error of the resting motor that is there in every pose",
@@ -160,109 +177,7 @@ MEANING = {
     "overshoot": "how far a step goes beyond where it settles",
     "settling time after the ramp": "until a step stays where it settles",
 }
-TITLES = {"tail_dof": "tails"}
-SHORT_S = 0.2
-"""Times below this are shown in milliseconds [s]."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One parameter as text, with its 95 % interval, and where these stand on its bar [%].
-
-    Attributes:
-        who: The motors; empty for the whole robot.
-        tick: Where the value stands.
-        note: What is missing where the logs do not identify it.
-    """
-
-    who: str
-    value: str
-    interval: str
-    left: float
-    width: float
-    tick: float
-    identified: bool
-    note: str
-
-
-@dataclass(frozen=True)
-class Group:
-    """The same parameter of all motors; `zero` lies on the bars [%], None: beyond them."""
-
-    title: str
-    meaning: str
-    unit: str
-    zero: float | None
-    rows: tuple[Row, ...]
-
-
-def parameter_groups(found: Calibration, robot: Robot) -> list[Group]:
-    """Return the parameters as text, those of the same name together."""
-    by_name: dict[str, list[Parameter]] = {}
-    for parameter in found.parameters:
-        by_name.setdefault(parameter.name, []).append(parameter)
-    return [_group(name, members, robot) for name, members in by_name.items()]
-
-
-def _group(name: str, members: Sequence[Parameter], robot: Robot) -> Group:
-    scale, unit = _unit(members, robot)
-    ends = scale * np.array([(p.low, p.value, p.high) for p in members])
-    known = ends[[p.identified for p in members]]
-    low, high = _span(known if len(known) else ends)
-    width = high - low if high > low else 1.0  # all of them exactly the same
-    at = np.clip(100.0 * (ends - low) / width, 0.0, 100.0)
-    zero = -100.0 * low / width
-    return Group(
-        title=TITLES.get(name, name),
-        meaning=MEANING.get(name, ""),
-        unit=unit,
-        zero=zero if 0.0 <= zero <= 100.0 else None,
-        rows=tuple(map(_row, members, ends, at)),
-    )
-
-
-def _unit(members: Sequence[Parameter], robot: Robot) -> tuple[float, str]:
-    unit = members[0].unit
-    if unit == "share":
-        return 100.0, "%"
-    if unit == "s" and max(abs(p.high) for p in members) < SHORT_S:
-        return 1e3, "ms"
-    return (1.0, "") if unit == "-" else shown_unit(unit, robot)
-
-
-def _span(ends: np.ndarray) -> tuple[float, float]:
-    """Return the ends of the bars' common scale; it begins at zero unless that is far away."""
-    low, high = float(ends.min()), float(ends.max())
-    if low > 0.0 and low < 0.6 * high:
-        low = 0.0
-    margin = 0.04 * (high - low) or 1.0
-    return (low if low == 0.0 else low - margin), high + margin
-
-
-def _row(parameter: Parameter, ends: FloatArray, at: FloatArray) -> Row:
-    low, value, high = (figure(x, ends[2] - ends[0]) for x in ends)
-    told = parameter.identified
-    return Row(
-        who=parameter.motor.replace("_", " ").replace("+", ", "),
-        value=value if told else "",
-        interval=f"{low} to {high}" if told else "",
-        left=float(at[0]),
-        width=float(at[2] - at[0]),
-        tick=float(at[1]),
-        identified=told,
-        note=parameter.note,
-    )
-
-
-def figure(value: float, width: float) -> str:
-    """Return a value with as many digits as an interval of this width leaves meaning."""
-    if width <= 0.0 or not np.isfinite(width):
-        return f"{value:.3g}"
-    decimals = int(np.clip(1 - np.floor(np.log10(width / 2.0)), 0, 6))
-    return f"{value + 0.0:.{decimals}f}"
-
-
-# The page.
+"""Meaning of the parameters, by name."""
 
 
 def write_calibration_page(
@@ -280,7 +195,8 @@ def write_calibration_page(
             "grade": "unknown" if better is None else "good" if better else "bad",
             "facts": _facts(found, settling_of(found, robot).payload),
             "sessions": held_out_table(found, robot),
-            "groups": parameter_groups(found, robot),
+            "parameters": parameter_table(found.parameters, robot),
+            "meanings": _meanings(found),
             "count_deg": None if units is None else units.deg_per_count,
             "left_out": Table(("run", "movement", "why"), left_out),
             "left_out_line": left_out_line(found),
@@ -289,6 +205,12 @@ def write_calibration_page(
     )
     with filling(folder) as partial:
         (partial / "index.html").write_text(text, encoding="utf-8")
+
+
+def _meanings(found: Calibration) -> Table:
+    names = dict.fromkeys(p.name for p in found.parameters)
+    rows = [(name, MEANING[name]) for name in names if name in MEANING]
+    return Table(("parameter", "meaning"), rows)
 
 
 def _facts(found: Calibration, payload: float) -> Table:
@@ -310,8 +232,6 @@ def _pictures(found: Calibration, runs: xr.Dataset, robot: Robot) -> dict[str, A
     seen, settling = predict(found, runs, robot), settling_of(found, robot)
     ramp = example_transient(found, runs, robot)
     figures = {}
-    if found.held_out:
-        figures["sessions"] = session_figure(found.held_out, robot, found.used_readings)
     if seen.counts.any():
         figures["expected"] = expected_figure(seen, robot)
         figures["quantiles"] = quantile_figure(seen, settling.tail_dof, robot)

@@ -12,12 +12,12 @@ import numpy as np
 
 from failuretwin.app.reports.isolability_report import sizes_of_motor
 from failuretwin.app.reports.technician_page import Section, write_page
-from failuretwin.app.terminal import Table, figures_table
+from failuretwin.app.terminal import Part, Table, figures_table
 from failuretwin.core.errors import InputError, counted
 from failuretwin.data_knowledge.store import filling, write_records
 from failuretwin.decision.robot_state import robot_state
 from failuretwin.decision.test_motions.health_check import OPEN, CheckResult
-from failuretwin.decision.test_motions.motions import Motions
+from failuretwin.decision.test_motions.motions import Motions, write_motions
 from failuretwin.digital_model.robot import Robot
 
 ERROR = "steady_state_error"
@@ -30,7 +30,7 @@ LIKELY = 0.05
 """Motors are named where it is open from this probability on."""
 
 
-def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[str | Table]:
+def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[Part]:
     """Return what a check found: the light, and what every motor showed."""
     diagnosis = result.diagnosis
     head = f"{result.light.upper()}: {diagnosis.verdict}"
@@ -71,11 +71,16 @@ def write_check_page(results: Sequence[CheckResult], robot: Robot, folder: Path)
         write_page(diagnoses, state, robot, partial / "index.html", sections=measured)
 
 
+def _shown(slides: bool) -> tuple[float, str]:
+    """Return factor and name of the unit in which positions of a motor are shown."""
+    return (1e3, "mm") if slides else (180.0 / np.pi, "deg")
+
+
 def motor_table(result: CheckResult, robot: Robot) -> Table:
     """Return what each motor showed, zeros and play in degrees, of slides in millimetres."""
     found, shown, rows = result.offsets, result.shown, []
     for k, name in enumerate(robot.motor_names):
-        factor, unit = (1e3, "mm") if robot.slides[k] else (180.0 / np.pi, "deg")
+        factor, unit = _shown(robot.slides[k])
         rows.append([
             name,
             f"{result.by_motor.get(name, 0.0):.1%}",
@@ -151,7 +156,7 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
             moved = new[what] - old[what]
             spread = float(np.hypot(new[f"{what}_deviation"], old[f"{what}_deviation"]))
             if abs(moved) > CHANGED * spread:
-                factor, unit = (1e3, "mm") if new["unit"] == "m" else (180.0 / np.pi, "deg")
+                factor, unit = _shown(new["unit"] == "m")
                 lines.append(
                     f"since {before['date'][:10]}: {what} of {new['motor']} changed by "
                     f"{factor * moved:+.2f} {unit} ({abs(moved) / spread:.1f} deviations)"
@@ -165,18 +170,27 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
 # Designs.
 
 
-def motion_lines(motions: Motions, robot: Robot) -> list[str | Table]:
-    """Return what is told to the motors, a row a movement, angles in degrees."""
-    factor = np.where(robot.slides, 1e3, 180.0 / np.pi)
+def motion_lines(motions: Motions, robot: Robot, written: Path | None = None) -> list[Part]:
+    """Return the movements of the motors, a row each; they go to a file if one is named.
+
+    Raises:
+        OutputError: If the file cannot be written.
+    """
+    saved = []
+    if written is not None:
+        write_motions(motions, robot, written)
+        saved = [f"written to {written}; nothing was moved"]
+    scales = [_shown(slides) for slides in robot.slides]
+    factor = np.array([scale for scale, _ in scales])
     rows = [
         [f"{k + 1}", f"{begin:.1f}", f"{ramp:.2f}", *(f"{x:.1f}" for x in factor * target)]
         for k, (begin, ramp, target) in enumerate(
             zip(motions.start_s, motions.ramp_s, motions.target, strict=True)
         )
     ]
-    units = ["mm" if slides else "deg" for slides in robot.slides]
-    heads = [f"{name} [{unit}]" for name, unit in zip(robot.motor_names, units, strict=True)]
+    heads = [f"{name} [{unit}]" for name, (_, unit) in zip(robot.motor_names, scales, strict=True)]
     return [
         f"{counted(len(rows), 'movement')} in {motions.duration_s:.1f} s",
         figures_table(["", "at [s]", "ramp [s]", *heads], rows),
+        *saved,
     ]
