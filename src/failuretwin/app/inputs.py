@@ -1,4 +1,4 @@
-"""From what stands on the command line to runs."""
+"""From options of the command line to runs, hypotheses and diagnosers."""
 
 from __future__ import annotations
 
@@ -43,16 +43,19 @@ REPORTED_ERROR_M = 1e-6
 """Error of recovered commands that the user is told of [m]; exact ones are below 1e-9."""
 
 
-def read_inputs(sources: Sequence[Path], robot: Robot, reading: LogOptions) -> xr.Dataset:
-    """Return the runs of all inputs as one run set."""
-    correction = None
+def read_inputs(reading: LogOptions, robot: Robot) -> xr.Dataset:
+    """Return the runs of all logs as one run set.
+
+    Raises:
+        InputError: If they cannot be read.
+    """
     options = ReadOptions(
         cast(As, reading.how), reading.published_labels, approximate=reading.approximate
     )
+    correction = None
     if reading.columns is not None:
-        options = _with_map(options, reading.columns, sources, robot)
-        correction = _correction(reading.columns, robot)
-    runs = read_runs(list(sources), robot, options)
+        options, correction = _with_map(options, reading.columns, reading.logs, robot)
+    runs = read_runs(list(reading.logs), robot, options)
     if correction is not None:
         runs = correction.runs(runs)
     error = float(runs.attrs.get(RECOVERY_ERROR, 0.0))
@@ -63,16 +66,6 @@ def read_inputs(sources: Sequence[Path], robot: Robot, reading: LogOptions) -> x
             err=True,
         )
     return runs
-
-
-def _correction(path: Path, robot: Robot) -> LogCorrection | None:
-    """Return how a wrong set-up of the log is undone, where a map says it."""
-    table = read_toml(path).get(CORRECTION)
-    if table is None:
-        return None
-    where = f"{path}: {CORRECTION}"
-    stated = from_table(CorrectionTable, table, where)
-    return LogCorrection.from_file(stated, len(robot.motors), where)
 
 
 SAME_PLACE_M = 1e-6
@@ -113,33 +106,43 @@ def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
 
 
 def _with_map(
-    options: ReadOptions, path: Path, sources: Sequence[Path], robot: Robot
-) -> ReadOptions:
-    """Return the options with a map of columns, topics or the angles of a LeRobot data set.
+    options: ReadOptions, path: Path, logs: Sequence[Path], robot: Robot
+) -> tuple[ReadOptions, LogCorrection | None]:
+    """Return the options with a map of columns, topics or angles, and the correction in it.
 
-    Where there is no such file yet, a guess is written and shown, and the work stops.
+    Raises:
+        InputError: If the map cannot be read. If there is no such file yet, a guess is written.
     """
-    if path.exists():
-        table = read_toml(path)
-        if "topics" in table:
-            topics = from_table(BagTopics, table["topics"], f"{path}: topics")
-            return replace(options, topics=topics)
-        if "lerobot" in table:
-            angles = from_table(LeRobotAngles, table["lerobot"], f"{path}: lerobot")
-            return replace(options, lerobot=angles)
-        if set(table) == {CORRECTION}:
-            return options
-        return replace(options, columns=read_column_map(path, robot))
-    log = next((s for s in sources if is_lerobot(s) or (s.suffix == ".csv" and s.is_file())), None)
+    if not path.exists():
+        raise _guessed(path, logs, robot)
+    table, correction = read_toml(path), None
+    if CORRECTION in table:
+        where = f"{path}: {CORRECTION}"
+        stated = from_table(CorrectionTable, table[CORRECTION], where)
+        correction = LogCorrection.from_file(stated, len(robot.motors), where)
+    if "topics" in table:
+        topics = from_table(BagTopics, table["topics"], f"{path}: topics")
+        options = replace(options, topics=topics)
+    elif "lerobot" in table:
+        angles = from_table(LeRobotAngles, table["lerobot"], f"{path}: lerobot")
+        options = replace(options, lerobot=angles)
+    elif set(table) != {CORRECTION}:
+        options = replace(options, columns=read_column_map(path, robot))
+    return options, correction
+
+
+def _guessed(path: Path, logs: Sequence[Path], robot: Robot) -> InputError:
+    """Write and show a guessed map; return the request to check it."""
+    log = next((s for s in logs if is_lerobot(s) or (s.suffix == ".csv" and s.is_file())), None)
     if log is None:
-        raise InputError(
+        return InputError(
             f"{path}: does not exist, and no CSV file or LeRobot data set is given to guess it "
             "from."
         )
     text = (lerobot_map_text if is_lerobot(log) else column_map_text)(log, robot)
     write_text(text, path)
     tell(text)
-    raise InputError(
+    return InputError(
         f"{path} did not exist. The guess above has been written there and nothing was read: check "
         "every line, correct it, and run the same command again."
     )

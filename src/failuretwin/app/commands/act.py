@@ -8,29 +8,13 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import (
-    EMULATED,
-    PATH,
-    ArmOptions,
-    RobotOptions,
-    SafetyOptions,
-    arm_options,
-    calibrated_robot_options,
-    json_option,
-    place_option,
-    plugin_option,
-    report_option,
-    robot_options,
-    safety_options,
-    space_options,
-    topics_option,
-)
+from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import show, tell, write_json
 from failuretwin.core.errors import InputError
 
 
 @click.command()
-@click.argument("task", metavar="TASK.csv", type=PATH)
+@click.argument("task", metavar="TASK.csv", type=opt.PATH)
 @click.option(
     "--strategy",
     type=click.Choice(["diagnose", "feedback", "open"]),
@@ -57,18 +41,16 @@ from failuretwin.core.errors import InputError
     metavar="MOTOR[=WEIGHT]",
     help="Motor to spare: plan poses that load and move it less. Can be given several times.",
 )
-@click.option(
-    "--wear",
-    "history",
-    type=PATH,
-    metavar="CAL.history.jsonl",
-    help="History that `diagnose --track` keeps: spare motors by their wear.",
+@opt.file_option(
+    "--wear history",
+    "CAL.history.jsonl",
+    "History that `diagnose --track` keeps: spare motors by their wear.",
 )
-@json_option("Write one object a target, one a line.")
-@arm_options
-@safety_options
-@plugin_option
-@calibrated_robot_options()
+@opt.json_option("Write one object a target, one a line.")
+@opt.arm_options
+@opt.safety_options
+@opt.plugin_option
+@opt.calibrated_robot_options()
 def act(
     task: Path,
     strategy: str,
@@ -77,9 +59,9 @@ def act(
     spare: tuple[str, ...],
     history: Path | None,
     json_file: Path | None,
-    arm: ArmOptions,
-    safety: SafetyOptions,
-    robot: RobotOptions,
+    arm: opt.ArmOptions,
+    safety: opt.SafetyOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Bring the tool to the targets of TASK.csv (columns x, y, z in metres; see docs/acting.md).
 
@@ -108,10 +90,10 @@ def act(
 
 
 @click.command()
-@place_option("ros1")
-@topics_option
-@robot_options
-def stop(place: str, topics: Path | None, robot: RobotOptions) -> None:
+@opt.place_option("ros1")
+@opt.topics_option
+@opt.robot_options
+def stop(place: str, topics: Path | None, robot: opt.RobotOptions) -> None:
     """Order an arm to stay where it is; an `act` that works on it ends.
 
     This is no emergency stop: the order goes through the network like any other. Keep the real one
@@ -123,36 +105,36 @@ def stop(place: str, topics: Path | None, robot: RobotOptions) -> None:
     from failuretwin.connection.links.base import Order
     from failuretwin.decision.acting.work import where_it_stands
 
-    if place == EMULATED:
+    if place == opt.EMULATED:
         raise InputError(
             "an emulated arm ends with its process. Name ros1, ros2 or rosbridge://HOST."
         )
     with ExitStack() as stack:
-        arm = commander_of(ArmOptions(place, (), True, topics), robot.known, robot.seed, stack)
+        arm = commander_of(opt.ArmOptions(place, (), True, topics), robot.known, robot.seed, stack)
         target = where_it_stands(arm)
         arm.send(Order(target, np.full(len(target), 0.1)))
         tell("told to stay where it is")
 
 
 @click.command()
-@click.argument("task", metavar="[TASK.csv]", type=PATH, required=False)
+@click.argument("task", metavar="[TASK.csv]", type=opt.PATH, required=False)
 @click.option(
     "--fault",
     metavar="MOTOR:stuck=SIZE",
     help="Stuck motor and its position [rad, m for one that slides]. Default: every motor in turn, "
     "all over its travel.",
 )
-@space_options
-@report_option("Draw a map of the workspace there, reach.png.")
-@json_option("Write all points.")
-@robot_options
+@opt.space_options
+@opt.report_option("Draw a map of the workspace there, reach.png.")
+@opt.json_option("Write all points.")
+@opt.robot_options
 def reach(
     task: Path | None,
     fault: str | None,
-    safety: SafetyOptions,
+    safety: opt.SafetyOptions,
     report: Path | None,
     json_file: Path | None,
-    robot: RobotOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Report what an arm can still reach: of TASK.csv, or of its usual workspace.
 

@@ -7,12 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from failuretwin.app.commands.options import (
-    PATH,
-    RobotOptions,
-    calibrated_robot_options,
-    json_option,
-)
+from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import show, tell, write_json
 from failuretwin.core.errors import InputError, OutputError
 
@@ -25,22 +20,20 @@ Report = tuple[list[str], list[dict[str, Any]]]
 
 @click.command()
 @click.argument(
-    "source", metavar="[RESULTS.jsonl|HISTORY.history.jsonl]", type=PATH, required=False
+    "source", metavar="[RESULTS.jsonl|HISTORY.history.jsonl]", type=opt.PATH, required=False
 )
-@click.option(
-    "--costs", type=PATH, metavar="FILE.toml", help="Cost table: downtime, repair, replacement."
-)
-@click.option("--template", type=PATH, metavar="FILE.toml", help="Write a cost table to fill in.")
+@opt.file_option("--costs", "FILE.toml", "Cost table: downtime, repair, replacement.")
+@opt.file_option("--template", "FILE.toml", "Write a cost table to fill in.")
 @click.option("--run", metavar="NAME", help="Run to use. Default: the last one.")
-@json_option("Write the advice.")
-@calibrated_robot_options()
+@opt.json_option("Write the advice.")
+@opt.calibrated_robot_options()
 def advise(
     source: Path | None,
     costs: Path | None,
     template: Path | None,
     run: str | None,
     json_file: Path | None,
-    robot: RobotOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Report the cheapest action: continue, compensate, slow down, inspect, replace, stop.
 
@@ -105,7 +98,7 @@ def _results_report(source: Path, costs_file: Path, run: str | None) -> Report:
     return [*lines, advice.verdict], [record]
 
 
-def _life_report(source: Path, robot: RobotOptions) -> Report:
+def _life_report(source: Path, robot: opt.RobotOptions) -> Report:
     """Return the remaining life of every motor of a tracked robot.
 
     Raises:

@@ -10,21 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from failuretwin.app.commands.options import (
-    PATH,
-    ArmOptions,
-    RobotOptions,
-    SafetyOptions,
-    arm_options,
-    calibrated_robot_options,
-    gathered,
-    hypotheses_option,
-    json_option,
-    plugin_option,
-    refuse_unused,
-    report_option,
-    safety_options,
-)
+from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import show, tell, write_json
 
 if TYPE_CHECKING:
@@ -41,7 +27,7 @@ class MotionOptions:
     usual: bool = False
     rest: float = 0.0
 
-    def checking(self, safety: SafetyOptions, robot: RobotOptions) -> Checking:
+    def checking(self, safety: opt.SafetyOptions, robot: opt.RobotOptions) -> Checking:
         """Return what a check and a design need."""
         from failuretwin.app.inputs import parse_cli_hypotheses
         from failuretwin.decision.test_motions.session import Checking
@@ -51,7 +37,7 @@ class MotionOptions:
         return Checking(known, safety.gate(known.robot), named, self.usual, robot.seed, self.rest)
 
 
-motion_options = gathered(
+motion_options = opt.gathered(
     MotionOptions,
     "motion",
     click.option(
@@ -60,7 +46,9 @@ motion_options = gathered(
         default=20.0,
         help="Time for the movements.",
     ),
-    hypotheses_option("Hypotheses to consider. Default: every single fault that shows at rest."),
+    opt.hypotheses_option(
+        "Hypotheses to consider. Default: every single fault that shows at rest."
+    ),
     click.option(
         "--usual",
         is_flag=True,
@@ -75,12 +63,10 @@ motion_options = gathered(
         "commanded arm is always waited for.",
     ),
 )
-write_option = click.option(
-    "--write",
-    "written",
-    type=PATH,
-    metavar="FILE",
-    help="Write the motions (.json, .csv, .mcap, .bag) for an arm that failuretwin cannot command. "
+write_option = opt.file_option(
+    "--write written",
+    "FILE",
+    "Write the motions (.json, .csv, .mcap, .bag) for an arm that failuretwin cannot command. "
     "Nothing moves.",
 )
 
@@ -94,27 +80,23 @@ MOTIONS = ("written", "motions", "keep", "speed_share", "floor", "radius")
 
 @click.command()
 @write_option
-@click.option(
-    "--log",
-    "logs",
-    multiple=True,
-    type=PATH,
-    metavar="INPUT",
-    help="Judge the log of a check that was recorded elsewhere. Nothing moves. Can be given "
+@opt.file_option(
+    "--log logs",
+    "INPUT",
+    "Judge the log of a check that was recorded elsewhere. Nothing moves. Can be given "
     "several times.",
+    multiple=True,
 )
-@click.option(
+@opt.file_option(
     "--motions",
-    type=PATH,
-    metavar="FILE",
-    help="Make these motions (.json, .csv, .mcap, .bag, or a file of --keep). Default: they are "
+    "FILE",
+    "Make these motions (.json, .csv, .mcap, .bag, or a file of --keep). Default: they are "
     "designed anew.",
 )
-@click.option(
+@opt.file_option(
     "--keep",
-    type=PATH,
-    metavar="FILE.json",
-    help="File for motions and results of this robot. If it exists, the same motions are made "
+    "FILE.json",
+    "File for motions and results of this robot. If it exists, the same motions are made "
     "again (without --seconds) and changes are reported.",
 )
 @click.option(
@@ -123,13 +105,13 @@ MOTIONS = ("written", "motions", "keep", "speed_share", "floor", "radius")
     default=0,
     help="Maximum number of further movements if the result is still open.",
 )
-@json_option("Write one object a line.")
-@report_option("Write index.html: the state of the robot, which motor, how surely, what to do.")
-@arm_options
+@opt.json_option("Write one object a line.")
+@opt.report_option("Write index.html: the state of the robot, which motor, how surely, what to do.")
+@opt.arm_options
 @motion_options
-@safety_options
-@plugin_option
-@calibrated_robot_options()
+@opt.safety_options
+@opt.plugin_option
+@opt.calibrated_robot_options()
 def check(
     written: Path | None,
     logs: tuple[Path, ...],
@@ -138,10 +120,10 @@ def check(
     further: int,
     json_file: Path | None,
     report: Path | None,
-    arm: ArmOptions,
+    arm: opt.ArmOptions,
     motion: MotionOptions,
-    safety: SafetyOptions,
-    robot: RobotOptions,
+    safety: opt.SafetyOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Move an arm for 20 or 60 s and report whether it is healthy, or which motor is not.
 
@@ -186,14 +168,14 @@ def _refuse_unused(
     """Raise InputError if options were given that have no effect beside these."""
     if logs:
         why = "with --log nothing is moved and nothing is kept"
-        refuse_unused(why, *DESIGN, *ARM, *MOTIONS)
+        opt.refuse_unused(why, *DESIGN, *ARM, *MOTIONS)
     if written is not None:
-        refuse_unused("with --write nothing is moved", *ARM, "keep", "json_file", "report")
+        opt.refuse_unused("with --write nothing is moved", *ARM, "keep", "json_file", "report")
     if motions is not None:
-        refuse_unused(f"{motions} says which motions are made", *DESIGN)
+        opt.refuse_unused(f"{motions} says which motions are made", *DESIGN)
     if keep is not None and keep.exists():
         why = f"{keep} exists and says which motions are made; to make others, keep them elsewhere"
-        refuse_unused(why, "motions", *DESIGN)
+        opt.refuse_unused(why, "motions", *DESIGN)
 
 
 def _check_outputs(keep: Path | None, json_file: Path | None, report: Path | None) -> None:
@@ -227,15 +209,15 @@ def _report_logs(
 )
 @write_option
 @motion_options
-@safety_options
-@plugin_option
-@calibrated_robot_options()
+@opt.safety_options
+@opt.plugin_option
+@opt.calibrated_robot_options()
 def design(
     movements: int,
     written: Path | None,
     motion: MotionOptions,
-    safety: SafetyOptions,
-    robot: RobotOptions,
+    safety: opt.SafetyOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Design movements that tell the most, and compare the faults that they and random ones show.
 
@@ -253,29 +235,28 @@ def design(
 
 
 @click.command()
-@click.option(
+@opt.file_option(
     "--motions",
-    type=PATH,
-    metavar="FILE",
-    help="Motions that `design` or `check` wrote (.json, .csv, .mcap, .bag), or a log or run set. "
+    "FILE",
+    "Motions that `design` or `check` wrote (.json, .csv, .mcap, .bag), or a log or run set. "
     "Default: the usual random movements.",
 )
-@hypotheses_option("Hypotheses to compare. Default: the paper's nine classes.")
-@report_option("Draw the smallest sizes there, isolability.png.")
-@json_option("Write the table.")
-@plugin_option
-@calibrated_robot_options()
+@opt.hypotheses_option("Hypotheses to compare. Default: the paper's nine classes.")
+@opt.report_option("Draw the smallest sizes there, isolability.png.")
+@opt.json_option("Write the table.")
+@opt.plugin_option
+@opt.calibrated_robot_options()
 def isolability(
     motions: Path | None,
     hypotheses: str | None,
     report: Path | None,
     json_file: Path | None,
-    robot: RobotOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Report the smallest fault of each motor and mode that motions of a robot can show."""
     from failuretwin.app.reports import isolability_report as reports
 
-    checking = MotionOptions(hypotheses).checking(SafetyOptions(), robot)
+    checking = MotionOptions(hypotheses).checking(opt.SafetyOptions(), robot)
     model = checking.known.robot
     found = (
         checking.isolability_of(checking.random_motions())

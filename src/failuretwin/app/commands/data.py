@@ -10,17 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 import failuretwin as ft
-from failuretwin.app.commands.options import (
-    PATH,
-    LogOptions,
-    RobotOptions,
-    calibrated_robot_options,
-    gathered,
-    hypotheses_option,
-    plugin_option,
-    reading_options,
-    robot_options,
-)
+from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import progress_bar, show, tell
 from failuretwin.core.errors import InputError, counted
 
@@ -29,30 +19,28 @@ if TYPE_CHECKING:
 
 
 @click.command("import")
-@click.argument("sources", nargs=-1, required=True, type=PATH, metavar="SRC...")
-@click.option(
+@opt.file_option(
     "--out",
-    required=True,
-    type=PATH,
-    help="Output: a run set (.nc, .zarr), a published layout (.mat: one file of cells, no ending "
+    "FILE",
+    "Output: a run set (.nc, .zarr), a published layout (.mat: one file of cells, no ending "
     "for a folder of pairs), or .csv.",
+    required=True,
 )
-@reading_options
-@robot_options
-def import_(sources: tuple[Path, ...], out: Path, reading: LogOptions, robot: RobotOptions) -> None:
+@opt.reading_options
+@opt.robot_options
+def import_(out: Path, reading: opt.LogOptions, robot: opt.RobotOptions) -> None:
     """Read logs and write them as one run set.
 
-    SRC is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
+    LOG is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
     downwards), such a file (.mat), a bag (.bag, .mcap), a LeRobot data set (a folder), an RTDE
     recording, or a CSV file, with --columns where its column names do not tell enough.
     """
-    from failuretwin.app.inputs import read_inputs
     from failuretwin.data_knowledge.readers.matlab import check_export_suffix, export_runs
 
     check_export_suffix(out)
-    if out.resolve() in [source.resolve() for source in sources]:
+    if out.resolve() in [log.resolve() for log in reading.logs]:
         raise InputError(f"{out}: is what is to be read. Give another name to write to.")
-    runs = read_inputs(sources, robot.model, reading)
+    runs = reading.runs(robot.model)
     export_runs(runs, out, ft.DigitalTwin(robot.model))
     tell(f"{counted(runs.sizes['run'], 'run')} written to {out}")
 
@@ -61,14 +49,14 @@ def import_(sources: tuple[Path, ...], out: Path, reading: LogOptions, robot: Ro
 
 
 @click.command()
-@click.option("--out", required=True, type=PATH, help="Run set to write (.nc or .zarr).")
+@opt.file_option("--out", "FILE", "Run set to write (.nc or .zarr).", required=True)
 @click.option(
     "--runs-per-class",
     type=click.IntRange(min=1),
     default=400,
     help="Runs of each hypothesis; the paper has 400.",
 )
-@hypotheses_option(
+@opt.hypotheses_option(
     "Hypotheses to simulate, such as healthy,motor_2:stuck. Default: the paper's nine classes."
 )
 @click.option(
@@ -84,11 +72,10 @@ def import_(sources: tuple[Path, ...], out: Path, reading: LogOptions, robot: Ro
     help="Sensors of the profile to simulate in addition to the tool's position: accelerometer, "
     "gyroscope, orientation, wire.",
 )
-@click.option(
+@opt.file_option(
     "--faults",
-    type=PATH,
-    metavar="FILE",
-    help="Size, onset and growth of faults: a TOML file with a table for each mode, such as "
+    "FILE",
+    "Size, onset and growth of faults: a TOML file with a table for each mode, such as "
     "[drift]. Default: the paper's stuck and steady_state_error; the other modes as assumed in "
     "docs/fault_modes.md.",
 )
@@ -104,8 +91,8 @@ def import_(sources: tuple[Path, ...], out: Path, reading: LogOptions, robot: Ro
     help="Dask scheduler whose workers do the work instead, such as tcp://host:8786. They must "
     "share the folder of --out.",
 )
-@plugin_option
-@calibrated_robot_options("none")
+@opt.plugin_option
+@opt.calibrated_robot_options("none")
 def simulate(
     out: Path,
     runs_per_class: int,
@@ -115,7 +102,7 @@ def simulate(
     faults: Path | None,
     workers: int,
     scheduler: str | None,
-    robot: RobotOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Make labelled runs with the digital twin and write them as a run set.
 
@@ -168,10 +155,10 @@ class UrdfOptions:
         return check_urdf(self.path, self.base, self.tool, 1e-3 * self.sensor_noise)
 
 
-urdf_options = gathered(
+urdf_options = opt.gathered(
     UrdfOptions,
     "urdf",
-    click.argument("path", type=PATH, metavar="URDF"),
+    click.argument("path", type=opt.PATH, metavar="URDF"),
     click.option(
         "--base",
         metavar="LINK",
@@ -195,6 +182,9 @@ urdf_options = gathered(
 )
 
 
+profile_option = opt.file_option("--out", "PROFILE", "Profile to write: .toml.", required=True)
+
+
 @click.group()
 def robot() -> None:
     """Look a URDF over, make a robot profile of it, and fit it to healthy logs."""
@@ -212,7 +202,7 @@ def check(urdf: UrdfOptions) -> None:
 
 
 @robot.command()
-@click.option("--out", required=True, type=PATH, metavar="PROFILE", help="Profile to write: .toml.")
+@profile_option
 @click.option(
     "--home",
     metavar="ANGLE,...",
@@ -275,11 +265,10 @@ def _home(text: str | None, report: UrdfReport) -> list[float]:
 
 
 @robot.command("fit")
-@click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG...")
-@click.option("--out", required=True, type=PATH, metavar="PROFILE", help="Profile to write: .toml.")
-@reading_options
-@robot_options
-def fit_(logs: tuple[Path, ...], out: Path, reading: LogOptions, robot: RobotOptions) -> None:
+@profile_option
+@opt.reading_options
+@opt.robot_options
+def fit_(out: Path, reading: opt.LogOptions, robot: opt.RobotOptions) -> None:
     """Find frames, tool point, senses, zeros and geometry from poses in which a healthy arm rests.
 
     LOG is any input of `diagnose`. The profile of --robot is written with the fitted values, its
@@ -287,15 +276,14 @@ def fit_(logs: tuple[Path, ...], out: Path, reading: LogOptions, robot: RobotOpt
     """
     from datetime import UTC, datetime
 
-    from failuretwin.app.inputs import read_inputs
     from failuretwin.app.reports.robot_report import registration_parts
     from failuretwin.connection.registration.fit import fit_registration
     from failuretwin.digital_model.profile_text import fitted_text
 
     model = robot.model
     _check_profile(out, model.source)
-    runs = read_inputs(logs, model, reading)
-    names = ", ".join(log.name for log in logs)
+    runs = reading.runs(model)
+    names = ", ".join(log.name for log in reading.logs)
     found = fit_registration(runs, model, names, datetime.now(UTC).date().isoformat())
     text = fitted_text(model.source.read_text(encoding="utf-8"), model.source, out, found.profile)
     _write_profile(text, out)

@@ -10,18 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 import failuretwin as ft
-from failuretwin.app.commands.options import (
-    PATH,
-    LogOptions,
-    RobotOptions,
-    calibrated_robot_options,
-    hypotheses_option,
-    json_option,
-    plugin_option,
-    reading_options,
-    refuse_unused,
-    report_option,
-)
+from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import progress_bar, show, tell
 from failuretwin.core.errors import InputError, counted
 
@@ -74,7 +63,6 @@ class Findings:
 
 
 @click.command()
-@click.argument("inputs", nargs=-1, required=True, type=PATH, metavar="INPUT...")
 @click.option(
     "--method",
     default="bayes",
@@ -101,13 +89,12 @@ class Findings:
     "of experiments. Default: faults stay until repaired, and the runs, in their order, get one "
     "verdict in addition to their own.",
 )
-@click.option(
+@opt.file_option(
     "--out",
-    type=PATH,
-    metavar="FILE",
-    help="Calibration to write: learned by --self-calibrate, or by --track without --calibration.",
+    "FILE",
+    "Calibration to write: learned by --self-calibrate, or by --track without --calibration.",
 )
-@hypotheses_option(
+@opt.hypotheses_option(
     "Hypotheses to consider, at least two: healthy, MOTOR:MODE, two of these joined by '+', or "
     "unknown. Example: healthy,motor_2:stuck. Default: the paper's nine classes."
 )
@@ -132,14 +119,15 @@ class Findings:
     help="Sensors to use: tool (its position), orientation, accelerometer, gyroscope, wire, "
     "encoders, or several joined by '+'. Default: tool where runs have it, else what they have.",
 )
-@json_option("Write one object a run, one a line.")
-@click.option("--csv", "csv_file", type=PATH, help="Write a table, a row a run.")
-@report_option("Write index.html: the state of the robot, what to do, and pictures of some runs.")
-@reading_options
-@plugin_option
-@calibrated_robot_options()
+@opt.json_option("Write one object a run, one a line.")
+@opt.file_option("--csv csv_file", "FILE", "Write a table, a row a run.")
+@opt.report_option(
+    "Write index.html: the state of the robot, what to do, and pictures of some runs."
+)
+@opt.reading_options
+@opt.plugin_option
+@opt.calibrated_robot_options()
 def diagnose(
-    inputs: tuple[Path, ...],
     method: str,
     track: bool,
     self_calibrate: bool,
@@ -153,12 +141,12 @@ def diagnose(
     json_file: Path | None,
     csv_file: Path | None,
     report: Path | None,
-    reading: LogOptions,
-    robot: RobotOptions,
+    reading: opt.LogOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Diagnose runs from commands and tool path alone, or what other sensors saw (--sensing).
 
-    INPUT is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
+    LOG is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
     downwards), such a file (.mat), a bag (.bag, .mcap), a LeRobot data set (a folder), an RTDE
     recording, or a CSV file, with --columns where its column names do not tell enough.
     """
@@ -181,12 +169,12 @@ def diagnose(
         sensing=sensing,
     )
     if method != given.BAYES:
-        refuse_unused("only the Bayesian diagnosis has these options", *BAYES_ONLY)
+        opt.refuse_unused("only the Bayesian diagnosis has these options", *BAYES_ONLY)
     diagnoser = given.chosen_diagnoser(method, bayes)
     together = track or self_calibrate
     _check_together(calibration, track, self_calibrate, out)
     history = _history(bayes, calibration, out) if track else None
-    runs = given.read_inputs(inputs, known.robot, reading)
+    runs = reading.runs(known.robot)
     sensed = sensing_of(runs, sensing)
     given.warn_mismatch(runs, given.expected_name(diagnoser))
     found = (
@@ -328,7 +316,7 @@ def _check_together(
             "--out, or --calibration to begin with the arm class."
         )
     if not (track or all_runs):
-        refuse_unused("nothing is learned without --track or --self-calibrate", *LEARNING)
+        opt.refuse_unused("nothing is learned without --track or --self-calibrate", *LEARNING)
 
 
 def _is_file(calibration: Path | None) -> bool:
@@ -364,7 +352,7 @@ def _keep(tracked: Tracked | None, runs: xr.Dataset, out: Path | None) -> None:
 
 
 @click.command()
-@report_option("Also write a page with pictures there (needs the extra `plots`).")
+@opt.report_option("Also write a page with pictures there (needs the extra `plots`).")
 def demo(report: Path | None) -> None:
     """Diagnose three simulated runs that come with the package, as `diagnose LOG` would.
 

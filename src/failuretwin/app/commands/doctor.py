@@ -9,13 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 import failuretwin as ft
-from failuretwin.app.commands.options import (
-    PATH,
-    LogOptions,
-    RobotOptions,
-    calibrated_robot_options,
-    reading_options,
-)
+from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import show, tell
 from failuretwin.core.errors import InputError, counted
 
@@ -31,33 +25,28 @@ NAMED = 3
 
 
 @click.command()
-@click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG...")
-@click.option(
+@opt.file_option(
     "--out",
-    type=PATH,
-    metavar="MAP.toml",
-    help="Column map to write, with the correction of a wrong set-up. If you agree with it, use it "
+    "MAP.toml",
+    "Column map to write, with the correction of a wrong set-up. If you agree with it, use it "
     "with --columns MAP.toml.",
 )
-@reading_options
-@calibrated_robot_options()
+@opt.reading_options
+@opt.calibrated_robot_options()
 def doctor(
-    logs: tuple[Path, ...],
     out: Path | None,
-    reading: LogOptions,
-    robot: RobotOptions,
+    reading: opt.LogOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Test whether logs fit the profile: senses, order, units, axes, zeros, frames, clocks, grids.
 
     LOG is any input of `diagnose`, faulty or not; all logs must share one set-up. Every mistake is
     weighed together with every fault, so that a broken motor is not taken for a wrong set-up.
     """
-    from failuretwin.app.inputs import read_inputs
-
     if out is not None and (out.suffix != ".toml" or out.exists()):
         raise InputError(f"{out}: expected a name that ends in .toml and is not taken yet.")
     known = robot.known
-    runs = read_inputs(logs, robot.model, reading)
+    runs = reading.runs(robot.model)
     seen = ft.BayesDiagnoser(known.twin, known.imperfections).seen(runs)
     set_ups = seen.set_ups()
     unfit = _unfit(seen, set_ups)

@@ -7,38 +7,25 @@ from pathlib import Path
 import click
 
 import failuretwin as ft
-from failuretwin.app.commands.options import (
-    PATH,
-    RobotOptions,
-    plugin_option,
-    published_labels_option,
-    report_option,
-    robot_options,
-)
+from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import show
 from failuretwin.core.errors import InputError
 
 
 @click.command()
-@click.argument("results", type=PATH, metavar="RESULTS.jsonl")
-@click.option(
+@click.argument("results", type=opt.PATH, metavar="RESULTS.jsonl")
+@opt.file_option(
     "--truth",
-    type=PATH,
-    metavar="RUNS",
-    help="Run set or raw sessions with the truth, needed for the coverage of intervals. Default: "
+    "RUNS",
+    "Run set or raw sessions with the truth, needed for the coverage of intervals. Default: "
     "the truth in the results.",
 )
-@published_labels_option
-@click.option(
-    "--against",
-    type=PATH,
-    metavar="OTHER.jsonl",
-    help="Compare with other results of the same runs.",
-)
-@click.option("--latex", type=PATH, metavar="FILE", help="Write the scores as LaTeX tables.")
-@report_option("Write a picture of the reliability.")
-@plugin_option
-@robot_options
+@opt.published_labels_option
+@opt.file_option("--against", "OTHER.jsonl", "Compare with other results of the same runs.")
+@opt.file_option("--latex", "FILE", "Write the scores as LaTeX tables.")
+@opt.report_option("Write a picture of the reliability.")
+@opt.plugin_option
+@opt.robot_options
 def evaluate(
     results: Path,
     truth: Path | None,
@@ -46,7 +33,7 @@ def evaluate(
     against: Path | None,
     latex: Path | None,
     report: Path | None,
-    robot: RobotOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Score the results of `diagnose --json` against the truth."""
     import numpy as np

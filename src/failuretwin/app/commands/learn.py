@@ -9,18 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 import failuretwin as ft
-from failuretwin.app.commands.options import (
-    PATH,
-    LogOptions,
-    RobotOptions,
-    calibrated_robot_options,
-    hypotheses_option,
-    plugin_option,
-    published_labels_option,
-    reading_options,
-    report_option,
-    robot_options,
-)
+from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import progress_bar, show, tell
 from failuretwin.core.errors import InputError
 
@@ -29,8 +18,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG...")
-@click.option("--out", required=True, type=PATH, help="Calibration to write (.toml).")
+@opt.file_option("--out", "FILE", "Calibration to write (.toml).", required=True)
 @click.option(
     "--hold-out",
     metavar="SESSION",
@@ -38,24 +26,23 @@ if TYPE_CHECKING:
     "each session is left out once, and the result learns from all.",
 )
 @click.option("--name", help="Name of the calibration in results. Default: the file's name.")
-@report_option("Write a page with tables and pictures.")
+@opt.report_option("Write a page with tables and pictures.")
 @click.option(
     "--pool",
     is_flag=True,
     help="Each LOG is a calibration of another robot of the kind: write their mean and spread, the "
     "prior of an uncalibrated robot.",
 )
-@reading_options
-@robot_options
+@opt.reading_options
+@opt.robot_options
 def calibrate(
-    logs: tuple[Path, ...],
     out: Path,
     hold_out: str | None,
     name: str | None,
     report: Path | None,
     pool: bool,
-    reading: LogOptions,
-    robot: RobotOptions,
+    reading: opt.LogOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Learn from healthy logs where the motors settle, how they lag and what goes wrong by chance.
 
@@ -63,7 +50,6 @@ def calibrate(
     path alone. Runs that are labelled or look faulty are left out. Step tests (CSV files, or
     folders that hold some) add servo loops and speed limits.
     """
-    from failuretwin.app.inputs import read_inputs
     from failuretwin.app.reports.calibration_report import (
         calibration_parts,
         write_calibration_page,
@@ -75,13 +61,13 @@ def calibrate(
     if pool:
         if hold_out is not None or report is not None:
             raise click.UsageError("--pool reads no logs. Leave out --hold-out and --report.")
-        _pool(logs, out, name, robot)
+        _pool(reading.logs, out, name, robot)
         return
-    tests, others = step_parameters.split_step_tests(logs, reading.columns)
+    tests, others = step_parameters.split_step_tests(reading.logs, reading.columns)
     steps = step_parameters.learn_loops(tests, robot.model)
     model = steps.robot
-    runs = read_inputs(others, model, reading)
-    source = ", ".join(str(log) for log in logs)
+    runs = replace(reading, logs=tuple(others)).runs(model)
+    source = ", ".join(map(str, reading.logs))
     wrong = _wrong_set_up(runs, model)
     try:
         found = ft.calibrate(runs, model, name or out.stem, source, hold_out)
@@ -120,7 +106,9 @@ def _wrong_set_up(runs: xr.Dataset, robot: ft.Robot) -> str:
     return f"{said}; what is learned of such logs is not the robot.{right}"
 
 
-def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: RobotOptions) -> None:
+def _pool(
+    calibrations: tuple[Path, ...], out: Path, name: str | None, robot: opt.RobotOptions
+) -> None:
     """Write the population that some calibrated robots come from."""
     from failuretwin.app.reports.calibration_report import population_parts
 
@@ -137,7 +125,7 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: Ro
 
 
 @click.command()
-@click.option("--out", required=True, type=PATH, metavar="MODEL", help="Network to write (.npz).")
+@opt.file_option("--out", "MODEL", "Network to write (.npz).", required=True)
 @click.option(
     "--network",
     type=click.Choice(["cnn", "motorwise", "lstm"]),
@@ -150,18 +138,18 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: Ro
     default=6000,
     help="Number of batches, of 64 runs each.",
 )
-@hypotheses_option(
+@opt.hypotheses_option(
     "Hypotheses that the network distinguishes, such as healthy,motor_2:stuck. Default: the "
     "paper's nine classes."
 )
-@plugin_option
-@calibrated_robot_options()
+@opt.plugin_option
+@opt.calibrated_robot_options()
 def train(
     out: Path,
     network: str,
     iterations: int,
     hypotheses: str | None,
-    robot: RobotOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Train a network on the imperfect twin, for `diagnose --method MODEL`.
 
@@ -196,25 +184,23 @@ def train(
 
 
 @click.command()
-@click.option("--out", required=True, type=PATH, metavar="DIR", help="Folder for everything.")
-@click.option(
-    "--test",
-    "test_path",
-    type=PATH,
-    metavar="PATH",
-    help="Real runs to test on. Default: runs of the physics engine, as a stand-in.",
+@opt.file_option("--out", "DIR", "Folder for everything.", required=True)
+@opt.file_option(
+    "--test test_path",
+    "PATH",
+    "Real runs to test on. Default: runs of the physics engine, as a stand-in.",
 )
-@published_labels_option
+@opt.published_labels_option
 @click.option("--quick", is_flag=True, help="A small version of about two minutes.")
 @click.option("--resume", is_flag=True, help="Continue an interrupted study.")
-@robot_options
+@opt.robot_options
 def study(
     out: Path,
     test_path: Path | None,
     published_labels: bool,
     quick: bool,
     resume: bool,
-    robot: RobotOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Repeat the paper's study: train its network on the published twin, test it, write a page.
 

@@ -11,20 +11,7 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
-from failuretwin.app.commands.options import (
-    EMULATED,
-    PATH,
-    LiveOptions,
-    ProbeOptions,
-    RobotOptions,
-    SafetyOptions,
-    calibrated_robot_options,
-    live_options,
-    plugin_option,
-    probe_options,
-    refuse_unused,
-    safety_options,
-)
+from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import console, tell, until_interrupted
 
 if TYPE_CHECKING:
@@ -38,11 +25,10 @@ PROBING = ("idle", "move", "speed_share", "floor", "radius")
 
 @click.command()
 @click.argument("source", metavar="SOURCE")
-@click.option(
+@opt.file_option(
     "--record",
-    type=PATH,
-    metavar="FILE.mcap",
-    help="Record readings, commands and diagnoses; Foxglove, PlotJuggler and failuretwin read it.",
+    "FILE.mcap",
+    "Record readings, commands and diagnoses; Foxglove, PlotJuggler and failuretwin read it.",
 )
 @click.option(
     "--false-alarms-per-100h",
@@ -60,20 +46,20 @@ PROBING = ("idle", "move", "speed_share", "floor", "radius")
     "as /joint_states; errors show sooner, but a wrong reading is taken for the motor. goals: the "
     "goals that they report to have received; a stuck motor shows sooner.",
 )
-@probe_options
-@safety_options
-@live_options
-@plugin_option
-@calibrated_robot_options()
+@opt.probe_options
+@opt.safety_options
+@opt.live_options
+@opt.plugin_option
+@opt.calibrated_robot_options()
 def watch(
     source: str,
     record: Path | None,
     budget: float,
     sensing: str,
-    probe: ProbeOptions,
-    safety: SafetyOptions,
-    live: LiveOptions,
-    robot: RobotOptions,
+    probe: opt.ProbeOptions,
+    safety: opt.SafetyOptions,
+    live: opt.LiveOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Watch a robot as a digital shadow: listen, report faults, and move nothing.
 
@@ -98,7 +84,7 @@ def watch(
     from failuretwin.decision.test_motions.probing import Prober
 
     if not probe.probes:
-        refuse_unused("nothing is moved without --probe N", *PROBING)
+        opt.refuse_unused("nothing is moved without --probe N", *PROBING)
     model, known, calibration = robot.model, robot.known, robot.calibration
     motors = model.motor_names
     diagnoser = monitor(known.twin, known.imperfections, budget, sensing)
@@ -107,7 +93,7 @@ def watch(
     limit = "" if "goals" in sensing else _limit(known.imperfections, motors, budget)
     tell(_rests_on(known.imperfections, when) + limit)
     # An emulated robot ends by itself, a log when it is over.
-    length = live.seconds if live.seconds and source != EMULATED else math.inf
+    length = live.seconds if live.seconds and source != opt.EMULATED else math.inf
     with ExitStack() as stack:
         probing = probe.probes > 0
         link, sinks = connect(source, model, live, robot.seed, stack, takes_orders=probing)
@@ -176,14 +162,14 @@ def _limit(known: Imperfections, motors: Sequence[str], budget: float) -> str:
     help="Obey the topic of commands, such as the orders of `failuretwin act`, instead of moving "
     "at random.",
 )
-@live_options
-@plugin_option
-@calibrated_robot_options()
+@opt.live_options
+@opt.plugin_option
+@opt.calibrated_robot_options()
 def emulate(
     target: str,
     obey: bool,
-    live: LiveOptions,
-    robot: RobotOptions,
+    live: opt.LiveOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Emulate a robot: random movements, the imperfections of a real arm, faults on a schedule.
 

@@ -15,6 +15,8 @@ import failuretwin as ft
 from failuretwin.core.errors import InputError
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from failuretwin.decision.acting.safety import SafetyGate
     from failuretwin.decision.test_motions.probing import ProbeRules
     from failuretwin.digital_model.calibrated_robot import CalibratedRobot
@@ -24,6 +26,11 @@ F = TypeVar("F", bound=Callable[..., Any])
 PATH = click.Path(path_type=Path)
 EMULATED = "emulated"
 """Name of an emulated arm, where others name a network."""
+
+
+def file_option(flag: str, metavar: str, text: str, **more: Any) -> Callable[[F], F]:
+    """Return an option that takes a path; the name of the parameter may follow the flag."""
+    return click.option(*flag.split(), type=PATH, metavar=metavar, help=text, **more)
 
 
 def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F], F]:
@@ -172,11 +179,10 @@ published_labels_option = click.option(
     help="Take the truth of raw sessions from folder names that end in _label_K and freeze the "
     "motor of labels 1-4 from sample 49 on, as the authors of the data did.",
 )
-topics_option = click.option(
+topics_option = file_option(
     "--topics",
-    type=PATH,
-    metavar="FILE.toml",
-    help="Names and types of the robot's ROS topics, see docs/live.md. Default: those of the data "
+    "FILE.toml",
+    "Names and types of the robot's ROS topics, see docs/live.md. Default: those of the data "
     "set's authors.",
 )
 fault_option = click.option(
@@ -192,17 +198,29 @@ fault_option = click.option(
 
 @dataclass(frozen=True)
 class LogOptions:
-    """Values of `reading_options`: how logs become runs."""
+    """Values of `reading_options`: logs, and how they become runs."""
 
+    logs: tuple[Path, ...]
     how: str
     published_labels: bool
     columns: Path | None
     approximate: bool
 
+    def runs(self, robot: ft.Robot) -> xr.Dataset:
+        """Return the runs of all logs as one run set.
+
+        Raises:
+            InputError: If they cannot be read.
+        """
+        from failuretwin.app.inputs import read_inputs
+
+        return read_inputs(self, robot)
+
 
 reading_options = gathered(
     LogOptions,
     "reading",
+    click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG..."),
     click.option(
         "--as",
         "how",
@@ -212,11 +230,10 @@ reading_options = gathered(
         "straight lines as the authors published them.",
     ),
     published_labels_option,
-    click.option(
+    file_option(
         "--columns",
-        type=PATH,
-        metavar="MAP.toml",
-        help="What the columns of a CSV file (or the topics of a bag, or the angles of a LeRobot "
+        "MAP.toml",
+        "What the columns of a CSV file (or the topics of a bag, or the angles of a LeRobot "
         "data set) are. If MAP.toml does not exist, a guess is written there for you to check.",
     ),
     click.option(
