@@ -76,11 +76,7 @@ def emulated_arm(
 
 
 def known_arm(robot: Robot, calibration: Path | None = None) -> CalibratedRobot:
-    """Return the healthy behaviour of an emulated arm.
-
-    Args:
-        robot: The robot.
-        calibration: Its calibration; None: that of its profile, the ideal twin if it names none.
+    """Return an emulated robot; None: with the calibration of its profile, or the ideal twin.
 
     Raises:
         InputError: If the calibration cannot be read.
@@ -90,13 +86,9 @@ def known_arm(robot: Robot, calibration: Path | None = None) -> CalibratedRobot:
 
 
 def emulation_with(faults: Sequence[str], known: CalibratedRobot, seed: int) -> Emulation:
-    """Return the settings of an emulated arm with faults.
+    """Return the settings of an emulated arm with faults, written as for `emulated_arm`.
 
-    Args:
-        faults: MOTOR:MODE[=SIZE][@START[-END]], the size in the unit of the mode; for a stuck motor
-            its position. Without a start a fault is present from the beginning.
-        known: The robot and its healthy behaviour.
-        seed: Seed of all random draws.
+    The size of a stuck motor is its position. Without a start a fault begins at once.
 
     Raises:
         InputError: If a fault cannot be read, its mode takes no size, or one mode has two sizes.
@@ -186,18 +178,12 @@ def connect(
 ) -> tuple[Source, list[Sink]]:
     """Return the source that a SOURCE on the command line names, and the sinks of its network.
 
-    Args:
-        text: One of `SOURCES`.
-        robot: The robot.
-        live: Topics, faults, pace and length.
-        seed: Seed of all random draws.
-        stack: Closes everything in the end.
-        takes_orders: Whether the source must be a `Commander`. An emulated arm then works in
-            shifts, and takes orders in its breaks.
+    The stack closes them. With `takes_orders` the source must be a `Commander`; an emulated arm
+    then works in shifts, and takes orders in its breaks.
 
     Raises:
-        InputError: If it does not exist, cannot be reached, is none of these, takes no orders, or
-            gets options that only an emulated robot has.
+        InputError: If it does not exist, cannot be reached, is none of `SOURCES`, takes no orders,
+            or gets options that only an emulated robot has.
     """
     if text == EMULATED:
         return stack.enter_context(_emulated(robot, live, seed, takes_orders)), []
@@ -279,11 +265,7 @@ def spared_of(
 ) -> FloatArray | None:
     """Return the weights of motors to spare, (motor,); None if no motor is spared.
 
-    Args:
-        texts: MOTOR or MOTOR=WEIGHT; replaces the weight from the history for this motor.
-        history: CAL.history.jsonl; None: no history.
-        model: The robot.
-        tell: Called with the wear found in the history.
+    Texts (MOTOR or MOTOR=WEIGHT) replace the weights from the history, whose wear is told.
 
     Raises:
         InputError: If a motor is unknown, a weight is no number, or the history cannot be read.

@@ -35,12 +35,7 @@ POLL_S = 0.01
 
 
 def obey(target: str, emulation: Emulation, live: LiveOptions) -> None:
-    """Publish readings and carry out the commands of the network, until interrupted.
-
-    Args:
-        target: The network, such as ``ros1``.
-        emulation: The robot.
-        live: Topics, pace and length.
+    """Publish readings and carry out the commands of a network, until interrupted.
 
     Raises:
         InputError: If the target is no network, or cannot be reached.
@@ -64,7 +59,7 @@ def obey(target: str, emulation: Emulation, live: LiveOptions) -> None:
 
 
 def play(target: str, emulation: Emulation, live: LiveOptions) -> None:
-    """Publish or record a robot that moves at random; arguments as in `obey`.
+    """Publish or record a robot that moves at random.
 
     Raises:
         InputError: If the target is no network and no .mcap file, or fails.

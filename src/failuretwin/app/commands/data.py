@@ -31,9 +31,7 @@ if TYPE_CHECKING:
 def import_(out: Path, reading: opt.LogOptions, robot: opt.RobotOptions) -> None:
     """Read logs and write them as one run set.
 
-    LOG is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
-    downwards), such a file (.mat), a bag (.bag, .mcap), a LeRobot data set (a folder), an RTDE
-    recording, or a CSV file, with --columns where its column names do not tell enough.
+    LOG is any input of `diagnose`.
     """
     from failuretwin.data_knowledge.readers.matlab import check_export_suffix, export_runs
 

@@ -244,14 +244,7 @@ def _track(runs: xr.Dataset, bayes: ft.BayesDiagnoser, history: History) -> Find
 def _self_calibrate(
     runs: xr.Dataset, bayes: ft.BayesDiagnoser, calibration: Path | None, out: Path | None
 ) -> Findings:
-    """Return diagnoses that learn the robot from all runs at once.
-
-    Args:
-        runs: The runs.
-        bayes: The diagnoser of single runs.
-        calibration: Calibration to start from; None: that of the kind of arm.
-        out: File for the learned calibration; None: not written.
-    """
+    """Return diagnoses that learn the robot from all runs at once, from a calibration on."""
     from failuretwin.connection.calibration.result import check_calibration_file
     from failuretwin.inference.together.folder_posterior import PASSES
 
@@ -271,14 +264,7 @@ def _self_calibrate(
 def _tell_ruled_out(
     runs: xr.Dataset, bayes: ft.BayesDiagnoser, diagnoses: Sequence[ft.Diagnosis], usual: Priors
 ) -> None:
-    """Tell where runs show errors of a size that the user has ruled out.
-
-    Args:
-        runs: The runs.
-        bayes: What diagnosed them, with a range of errors.
-        diagnoses: Of each run.
-        usual: Beliefs without that range.
-    """
+    """Report runs with errors of a size that the user has ruled out; `usual` priors allow all."""
     from failuretwin.inference.explanation import joint_names_in
 
     free = replace(bayes, priors=usual).diagnose(runs)

@@ -52,14 +52,11 @@ def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F],
 
 
 def refuse_unused(why: str, *names: str) -> None:
-    """Refuse options that would do nothing, where the user has given some.
+    """Raise InputError if the user has given options that have no effect here, and say why.
 
     Args:
-        why: Why they would do nothing, the beginning of a sentence.
+        why: The reason, the beginning of a sentence.
         names: Names of the parameters.
-
-    Raises:
-        InputError: If one was given.
     """
     context = click.get_current_context()
     given = [
@@ -82,20 +79,12 @@ class RobotOptions:
 
     @property
     def model(self) -> ft.Robot:
-        """The robot of the profile.
-
-        Raises:
-            InputError: If there is no such robot.
-        """
+        """The robot of the profile."""
         return ft.load_robot(self.robot)
 
     @property
     def known(self) -> CalibratedRobot:
-        """The robot with its servo loops and healthy behaviour.
-
-        Raises:
-            InputError: If there is no such robot or calibration.
-        """
+        """The robot with its servo loops and healthy behaviour."""
         return ft.load_calibration(self.calibration, self.robot)
 
 
@@ -207,11 +196,7 @@ class LogOptions:
     approximate: bool
 
     def runs(self, robot: ft.Robot) -> xr.Dataset:
-        """Return the runs of all logs as one run set.
-
-        Raises:
-            InputError: If they cannot be read.
-        """
+        """Return the runs of all logs as one run set."""
         from failuretwin.app.inputs import read_inputs
 
         return read_inputs(self, robot)

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin import __version__
 from failuretwin.app.reports.calibration_pictures import (
     channels,
     expected_figure,
@@ -222,7 +221,6 @@ def _facts(found: Calibration, payload: float) -> Table:
         ("that is", f"{found.movements} settled movements of {found.runs} runs, by {way}"),
         ("protocol", f"{protocol}: healthy logs only, no recorded failure"),
         ("payload", f"{payload} kg at the tool point" if payload else "none assumed"),
-        ("made by", f"failuretwin {__version__}"),
     ]
     return Table(("", ""), rows, header=False)
 
@@ -247,12 +245,7 @@ def _pictures(found: Calibration, runs: xr.Dataset, robot: Robot) -> dict[str, A
 
 
 def taught_section(learned: SelfCalibration, robot: Robot) -> Section:
-    """Return what was learned, how far it lies from such robots, what each run taught of it.
-
-    Args:
-        learned: What some runs say together.
-        robot: The robot.
-    """
+    """Return the parameters learned from runs, and the information that each run added."""
     found = learned.calibration
     by_run = [
         (diagnosis.run, f"{nats:.2f}")

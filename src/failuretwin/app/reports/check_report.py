@@ -53,13 +53,7 @@ def closing_lines(result: CheckResult, robot: Robot) -> list[str]:
 
 
 def write_check_page(results: Sequence[CheckResult], robot: Robot, folder: Path) -> None:
-    """Write the technician's page of checks into a folder.
-
-    Args:
-        results: Of one check, or of the logs of several.
-        robot: The robot.
-        folder: Where `index.html` goes.
-    """
+    """Write the technician's page of one check, or of the logs of several, into a folder."""
     diagnoses = [result.diagnosis for result in results]
     measured = [
         Section("What the check measured", tables=[motor_table(result, robot)])
