@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from failuretwin.app.reports.arm_sketch import Mark, arm_sketch
-from failuretwin.app.reports.plots import plain, plot_runs, render_page
+from failuretwin.app.reports.plots import plain, plot_runs, png, render_page
 from failuretwin.app.terminal import Table
 from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, OPEN_STATE, Diagnosis
 from failuretwin.data_knowledge.store import filling
@@ -134,11 +134,12 @@ def write_page(
             without pictures.
         sections: Further sections.
     """
-    judged = Judged.of(diagnoses)
+    judged, marks = Judged.of(diagnoses), _marks(state)
     rows = _rows(diagnoses, pictures or dict.fromkeys(range(MOST_PICTURES)), robot)
     values: dict[str, Any] = {
         "state": state,
-        "sketch": arm_sketch(robot, _marks(state)),
+        "sketch": png(arm_sketch(robot, marks)),
+        "marked": ", ".join(mark.label for mark in marks.values()) or "no joint",
         "shown": SHOWN,
         "rows": rows[:MOST_ROWS],
         "detailed": [row for row in rows if row.detailed],
