@@ -7,6 +7,8 @@ import time
 from collections import Counter, deque
 from collections.abc import Sequence
 from contextlib import nullcontext
+from datetime import date
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console, Group, RenderableType
@@ -28,8 +30,11 @@ from failuretwin.connection.links.statuses import (
 )
 from failuretwin.core.errors import counted
 from failuretwin.core.foreign import printable
+from failuretwin.decision.streaming.alarm_rule import movements_to_tell
 from failuretwin.decision.streaming.monitor import FaultMonitor
 from failuretwin.decision.test_motions.probing import Prober
+from failuretwin.digital_model.arm_classes import GENERIC_NAME
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.inference.calibration_fit import MISFIT
 from failuretwin.inference.explanation import percent
 
@@ -100,6 +105,34 @@ def watch_until_end(
             if going and prober is not None and prober.due:
                 prober.ask(screen.hear, screen.say)
     return screen.changes
+
+
+def basis_line(known: CalibratedRobot, calibration: Path | None, budget: float, goals: bool) -> str:
+    """Return the calibration that the answers rest on, and the delay that lost commands cause.
+
+    Reported `goals` show lost commands at once.
+    """
+    healthy = known.imperfections
+    if healthy.name == GENERIC_NAME:
+        line = (
+            f"healthy behaviour: {healthy.name}; {healthy.source}. This robot is not calibrated: "
+            "its behaviour is learned as it works, and until then faults take longer to show. "
+            "--calibration FILE uses a calibration"
+        )
+    else:
+        written = ""
+        if calibration is not None and calibration.is_file():
+            day = date.fromtimestamp(calibration.stat().st_mtime).isoformat()
+            written = f", written {day}"
+        line = f"healthy behaviour: {healthy.name} ({healthy.protocol}; {healthy.source}{written})"
+    needed = {} if goals else movements_to_tell(healthy, known.robot.motor_names, budget)
+    if not needed:
+        return line
+    worst = max(needed, key=lambda motor: needed[motor])
+    return (
+        f"{line}. At these losses a {worst.replace('_', ' ')} that sticks at rest takes about "
+        f"{needed[worst]} movements to be told from lost commands"
+    )
 
 
 def fit_of(monitor: FaultMonitor) -> str:

@@ -26,8 +26,9 @@ PIPE_WIDTH = 160
 
 
 def tell(text: str, *, err: bool = False) -> None:
-    """Print a line to stdout, or to stderr."""
-    click.echo(printable(text), err=err)
+    """Print a line to stdout, or to stderr; nothing if there is nothing to say."""
+    if text:
+        click.echo(printable(text), err=err)
 
 
 @dataclass(frozen=True)

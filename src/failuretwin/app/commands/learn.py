@@ -76,8 +76,7 @@ def calibrate(
             raise
         raise InputError(f"{wrong} {error}") from error
     found = step_parameters.with_step_tests(found, steps)
-    if wrong:
-        tell(f"warning: {wrong}", err=True)
+    tell(wrong and f"warning: {wrong}", err=True)
     if report is not None:
         write_calibration_page(found, runs, model, report)
     ft.save_calibration(found, model, out)

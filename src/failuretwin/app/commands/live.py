@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
-from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -16,7 +14,6 @@ from failuretwin.app.terminal import console, tell, until_interrupted
 
 if TYPE_CHECKING:
     from failuretwin.connection.links.base import Commander
-    from failuretwin.digital_model.nonidealities import Imperfections
 
 
 PROBING = ("idle", "move", "speed_share", "floor", "radius")
@@ -75,7 +72,7 @@ def watch(
     from contextlib import ExitStack
 
     from failuretwin.app.arms import connect
-    from failuretwin.app.live import fit_of, watch_until_end
+    from failuretwin.app.live import basis_line, fit_of, watch_until_end
     from failuretwin.app.shadow import Shadow
     from failuretwin.connection.links.recorder import Recorder
     from failuretwin.connection.links.ros_topics import load_topics
@@ -85,13 +82,10 @@ def watch(
 
     if not probe.probes:
         opt.refuse_unused("nothing is moved without --probe N", *PROBING)
-    model, known, calibration = robot.model, robot.known, robot.calibration
-    motors = model.motor_names
+    model, known = robot.model, robot.known
     diagnoser = monitor(known.twin, known.imperfections, budget, sensing)
     wait_s = load_topics(live.topics).wait_s
-    when = "" if calibration is None else _written(calibration)
-    limit = "" if "goals" in sensing else _limit(known.imperfections, motors, budget)
-    tell(_rests_on(known.imperfections, when) + limit)
+    tell(basis_line(known, robot.calibration, budget, "goals" in sensing))
     # An emulated robot ends by itself, a log when it is over.
     length = live.seconds if live.seconds and source != opt.EMULATED else math.inf
     with ExitStack() as stack:
@@ -107,43 +101,9 @@ def watch(
         shadow = Shadow(link, diagnoser, known.twin, sinks, wait_s)
         with until_interrupted():
             watch_until_end(shadow, console(), time.monotonic() + length, prober)
-    arm = statuses(shadow.snapshot.answer, motors)[0]
+    arm = statuses(shadow.snapshot.answer, model.motor_names)[0]
     tell(fit_of(diagnoser))
     tell(f"last answer: {arm.message}")
-
-
-def _written(calibration: Path) -> str:
-    """Return when the file of a calibration was written; empty for a bundled calibration."""
-    if not calibration.is_file():
-        return ""
-    return f", written {date.fromtimestamp(calibration.stat().st_mtime).isoformat()}"
-
-
-def _rests_on(known: Imperfections, when: str) -> str:
-    """Return the calibration that the answers rest on and its date, in one sentence."""
-    from failuretwin.digital_model.arm_classes import GENERIC_NAME
-
-    if known.name != GENERIC_NAME:
-        return f"healthy behaviour: {known.name} ({known.protocol}; {known.source}{when})"
-    return (
-        f"healthy behaviour: {known.name}; {known.source}. This robot is not calibrated: its "
-        "behaviour is learned as it works, and until then faults take longer to show. "
-        "--calibration FILE uses a calibration"
-    )
-
-
-def _limit(known: Imperfections, motors: Sequence[str], budget: float) -> str:
-    """Return the delay that lost commands cause: movements needed for the slowest motor."""
-    from failuretwin.decision.streaming.alarm_rule import movements_to_tell
-
-    needed = movements_to_tell(known, motors, budget)
-    if not needed:
-        return ""
-    worst = max(needed, key=lambda motor: needed[motor])
-    return (
-        f". At these losses a {worst.replace('_', ' ')} that sticks at rest takes about "
-        f"{needed[worst]} movements to be told from lost commands"
-    )
 
 
 @click.command()

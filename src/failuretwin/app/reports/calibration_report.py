@@ -31,6 +31,7 @@ from failuretwin.connection.calibration.cross_validation import (
 from failuretwin.connection.calibration.result import Calibration, Parameter, mean_gain
 from failuretwin.connection.self_calibration import SelfCalibration
 from failuretwin.connection.tracked_diagnosis import Tracked
+from failuretwin.core.errors import counted
 from failuretwin.data_knowledge.store import filling
 from failuretwin.digital_model.robot import Robot, shown_unit
 from failuretwin.inference.explanation import joint_names_in
@@ -125,12 +126,10 @@ def held_out_table(found: Calibration, robot: Robot) -> Table:
 def left_out_line(found: Calibration) -> str:
     """Return how many runs and movements were left out and why, in one line."""
     kinds = Counter((entry.movement == 0, entry.motor, entry.reason) for entry in found.left_out)
-    return "; ".join(_counted(count, *kind) for kind, count in kinds.most_common())
-
-
-def _counted(count: int, whole_run: bool, motor: str, reason: str) -> str:
-    what = ("run" if whole_run else "movement") + ("" if count == 1 else "s")
-    return f"{count} {what}: {motor} {reason}" if motor else f"{count} {what}: {reason}"
+    return "; ".join(
+        f"{counted(count, 'run' if whole else 'movement')}: {f'{motor} ' * bool(motor)}{reason}"
+        for (whole, motor, reason), count in kinds.most_common()
+    )
 
 
 def verdict_line(found: Calibration) -> str:
@@ -153,76 +152,28 @@ def verdict_line(found: Calibration) -> str:
 
 # The page.
 
-MEANING = {
-    "bias": "error of the resting motor that is there in every pose",
-    "compliance": "how far a motor gives way under the load torque of the arm",
-    "friction": "how far it stops short, seen in the direction of travel",
-    "scatter": "what is left, from movement to movement (scale of its Student t distribution)",
-    "tail_dof": "degrees of freedom of the scatter: 30 is nearly normal, 3 has heavy tails",
-    "delay, mean over runs": "dead time on top of the servo loop",
-    "ramp shortening, mean over runs": "share of its time by which a ramp ends early",
-    "lag": "time constant of a first-order lag on top of the servo loop",
-    "late starts": "movements that start late, all motors together",
-    "late start, median": "the median delay of a late start",
-    "readings stop, median": "time from a movement to the last reading before a late one",
-    "lost commands": "movements on time for which a motor does not get its command",
-    "lost commands when late": "the same for movements that start late",
-    "spoilt readings": "readings that are missing or out of range",
-    "loop gain P": "proportional gain of the servo loop, from step tests",
-    "loop gain I": "integral gain of the servo loop, from step tests",
-    "filter time": "time constant of the loop's input filter, from step tests",
-    "speed limit": "largest speed of the motor, from step tests",
-    "dead time": "time from a command to the first motion, from step tests",
-    "overshoot": "how far a step goes beyond where it settles",
-    "settling time after the ramp": "until a step stays where it settles",
-}
-"""Meaning of the parameters, by name."""
-
 
 def write_calibration_page(
     found: Calibration, runs: xr.Dataset, robot: Robot, folder: Path
 ) -> None:
     """Write `index.html` into a folder; the runs are those learned from or judged on."""
-    units, better = robot.profile.servo_units, found.beats_uncalibrated
-    left_out = [(e.run, str(e.movement or "all"), f"{e.motor} {e.reason}") for e in found.left_out]
+    units = robot.profile.servo_units
     text = render_page(
         "calibration.html.j2",
         {
             "found": found,
             "robot": robot.name,
             "verdict": verdict_line(found).rstrip("."),
-            "grade": "unknown" if better is None else "good" if better else "bad",
-            "facts": _facts(found, settling_of(found, robot).payload),
+            "payload": settling_of(found, robot).payload,
             "sessions": held_out_table(found, robot),
             "parameters": parameter_table(found.parameters, robot),
-            "meanings": _meanings(found),
             "count_deg": None if units is None else units.deg_per_count,
-            "left_out": Table(("run", "movement", "why"), left_out),
             "left_out_line": left_out_line(found),
             **_pictures(found, runs, robot),
         },
     )
     with filling(folder) as partial:
         (partial / "index.html").write_text(text, encoding="utf-8")
-
-
-def _meanings(found: Calibration) -> Table:
-    names = dict.fromkeys(p.name for p in found.parameters)
-    rows = [(name, MEANING[name]) for name in names if name in MEANING]
-    return Table(("parameter", "meaning"), rows)
-
-
-def _facts(found: Calibration, payload: float) -> Table:
-    way = "the motors' own readings" if found.used_readings else "the tool path alone"
-    protocol = found.imperfections.protocol
-    rows = [
-        ("learned from", found.imperfections.source),
-        ("sessions", f"{len(found.sessions)}: {', '.join(found.sessions)}"),
-        ("that is", f"{found.movements} settled movements of {found.runs} runs, by {way}"),
-        ("protocol", f"{protocol}: healthy logs only, no recorded failure"),
-        ("payload", f"{payload} kg at the tool point" if payload else "none assumed"),
-    ]
-    return Table(("", ""), rows, header=False)
 
 
 def _pictures(found: Calibration, runs: xr.Dataset, robot: Robot) -> dict[str, Any]:
