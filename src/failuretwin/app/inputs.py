@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
 
 REPORTED_ERROR_M = 1e-6
-"""Error of recovered commands that the user is told of [m]; exact ones are below 1e-9."""
+"""Error of recovered commands from which it is reported [m]; exact ones are below 1e-9."""
 
 
 def read_inputs(reading: LogOptions, robot: Robot) -> xr.Dataset:
@@ -69,13 +69,13 @@ def read_inputs(reading: LogOptions, robot: Robot) -> xr.Dataset:
 
 
 SAME_PLACE_M = 1e-6
-"""Error by which a tool that is computed from motor readings may be off them: rounding [m]."""
+"""Rounding error of a tool path that is computed from motor readings [m]."""
 
 
 def with_doubts(
     diagnoses: Sequence[Diagnosis], runs: xr.Dataset, twin: DigitalTwin
 ) -> list[Diagnosis]:
-    """Return diagnoses with what the way doubts them in which the logs were made."""
+    """Return diagnoses with a caveat if the tool path was computed from motor readings."""
     if not _is_computed(runs, twin):
         return list(diagnoses)
     return [with_reading_doubt(one, one.diagnosis or "") for one in diagnoses]
@@ -92,7 +92,7 @@ def _is_computed(runs: xr.Dataset, twin: DigitalTwin) -> bool:
 
 
 def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
-    """Tell the user where simulated runs lack the imperfections (by name) that are expected."""
+    """Warn if simulated runs have other imperfections than the expected ones (by name)."""
     try:
         made_with = json.loads(runs.attrs["configuration"])["imperfections"]
     except (KeyError, TypeError, ValueError):  # a run set of other people may say anything there
@@ -148,7 +148,7 @@ def _guessed(path: Path, logs: Sequence[Path], robot: Robot) -> InputError:
     )
 
 
-# What commands need to know of the extra `learn`.
+# The extra `learn`.
 
 
 def check_learning() -> None:
@@ -159,19 +159,19 @@ def check_learning() -> None:
     del sklearn, torch
 
 
-# Which diagnoser the user asks for.
+# Diagnoser of `--method`.
 
 BAYES = "bayes"
 """Name of the method that needs no file."""
 BLEND = f"{BAYES}+"
-"""What stands before the file of a network that is blended with it."""
+"""Prefix of the file of a network that is blended with it."""
 
 
 def parse_cli_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ...] | None:
-    """Return the hypotheses that the user names, separated by commas; None where none are.
+    """Return the hypotheses of a text separated by commas; None: the default ones.
 
     Raises:
-        InputError: If one cannot be read, or there is only one, which would always be certain.
+        InputError: If one cannot be read, or there is only one, which is always certain.
     """
     if text is None:
         return None
@@ -190,7 +190,7 @@ def parse_cli_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ..
 
 
 def chosen_diagnoser(method: str, bayes: BayesDiagnoser) -> Diagnoser:
-    """Return the diagnoser that the user names.
+    """Return the diagnoser of `--method`.
 
     Args:
         method: ``bayes``, the file of a network, ``bayes+`` and that file, or ``module:Class`` of
@@ -231,7 +231,7 @@ def _pooled(network: LearnedDiagnoser, bayes: BayesDiagnoser, path: Path) -> Hyb
 def expected_name(diagnoser: Diagnoser) -> str:
     """Return the name of the healthy behaviour that a diagnoser expects.
 
-    A class of the user expects nothing that is known here.
+    The expectation of a user's class is unknown.
     """
     encoder = getattr(diagnoser, "encoder", None)
     if encoder is None:

@@ -32,13 +32,13 @@ SURE = 0.9
 
 @dataclass(frozen=True)
 class Findings:
-    """Diagnoses of runs, and what the runs taught together.
+    """Diagnoses of runs, and the robot learned from them.
 
     Attributes:
         diagnoses: Diagnosis of each run.
         bayes: The Bayesian diagnoser, with the calibration learned from the runs.
         remarks: Remarks on the robot.
-        lines: Lines on everything learned.
+        lines: Lines on the learned robot.
         sections: The same as sections of a page.
         keep: Writes what was learned run by run.
     """

@@ -171,7 +171,7 @@ def _troubles(shadow: Shadow, since_s: float) -> tuple[str, ...]:
     return tuple(found)
 
 
-# The live view: motors, residual, posterior over time, and what changed.
+# The live view: motors, residual, posterior over time, changes.
 
 STYLES = {
     LEVEL_OK: "green",
@@ -181,9 +181,9 @@ STYLES = {
 }
 BLOCKS = " ▁▂▃▄▅▆▇█"
 COLUMNS = 60
-"""Width of the posterior over time."""
+"""Width of the posterior over time [columns]."""
 COLUMN_S = 1.0
-"""Time of the stream that one column stands for [s]."""
+"""Time of the stream for each column [s]."""
 RESIDUAL_MM = 50.0
 """Residual that fills its bar [mm]."""
 BAR = 20
@@ -192,7 +192,7 @@ SHOWN_CHANGES = 8
 
 
 class View:
-    """Draws what the shadow knows."""
+    """Live view of a shadow."""
 
     def __init__(self, motors: Sequence[str], source: str) -> None:
         self._motors = motors
@@ -216,7 +216,7 @@ class View:
     def draw(
         self, snapshot: Snapshot, counts: LinkCounts, changes: Sequence[Change]
     ) -> RenderableType:
-        """Return the view of what is known now; of the changes the newest is the last."""
+        """Return the view of a snapshot; the newest change is the last."""
         lines = [Text(printable(str(change))) for change in list(changes)[-SHOWN_CHANGES:]]
         return Group(
             self._head(snapshot, counts),

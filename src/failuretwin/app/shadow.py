@@ -1,4 +1,4 @@
-"""The digital shadow: from the events of a link to answers, whatever happens to the link."""
+"""The digital shadow: from the events of a link to answers and messages."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Snapshot:
 
 
 class Shadow:
-    """Feeds a diagnoser from a source and publishes what was seen and what is believed.
+    """Feeds a diagnoser from a source and publishes events and answers.
 
     Commands may arrive `commands_late_s` [s] later than their stamps.
 
@@ -65,7 +65,7 @@ class Shadow:
         sinks: The sinks.
         twin: The twin of the robot.
         monitor: The diagnoser if it is a `FaultMonitor`, else None.
-        snapshot: What is known now.
+        snapshot: The latest state.
         clock: The robot's clock.
         reference: The commanded angles over time.
     """
@@ -252,7 +252,7 @@ class Changes:
     def notice(
         self, snapshot: Snapshot, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]
     ) -> list[Change]:
-        """Return what has changed since the last call."""
+        """Return the changes since the last call."""
         texts = self._link(snapshot.stream_time, counts, jumps, troubles)
         texts += self._silence(snapshot)
         texts += self._diagnosis(snapshot)

@@ -36,10 +36,10 @@ class Table:
     """Rows of text under headings.
 
     Attributes:
-        headings: One a column.
-        rows: Cells, as many as there are headings.
+        headings: Headings of the columns.
+        rows: Cells of each row, one for each heading.
         align: ``l`` (text) or ``r`` (figures) for each column; empty: all to the left.
-        title: What stands above; empty: nothing.
+        title: Title above the table; empty: none.
         header: Whether the headings are shown on a terminal.
     """
 
@@ -66,7 +66,7 @@ Part = str | Table
 
 
 def console() -> Console:
-    """Return the console that everything is printed on; brackets and colons are as they are."""
+    """Return the console for all output; it takes brackets and colons literally."""
     from rich.console import Console
 
     plain = Console(highlight=False, markup=False, emoji=False)
@@ -112,7 +112,7 @@ def write_json(records: Iterable[Mapping[str, Any]], path: Path | None) -> None:
 
 @contextmanager
 def until_interrupted() -> Iterator[None]:
-    """End what is inside on Ctrl-C, and say so."""
+    """End the block on Ctrl-C, and report it."""
     try:
         yield
     except KeyboardInterrupt:

@@ -28,7 +28,7 @@ class MotionOptions:
     rest: float = 0.0
 
     def checking(self, safety: opt.SafetyOptions, robot: opt.RobotOptions) -> Checking:
-        """Return what a check and a design need."""
+        """Return the settings of a check or a design."""
         from failuretwin.app.inputs import parse_cli_hypotheses
         from failuretwin.decision.test_motions.session import Checking
 
@@ -59,7 +59,7 @@ motion_options = opt.gathered(
         type=click.FloatRange(0.0, 10.0),
         default=0.0,
         metavar="SECONDS",
-        help="Minimum time at rest after each movement. Default: what arms of this kind need. A "
+        help="Minimum time at rest after each movement. Default: by the kind of arm. A "
         "commanded arm is always waited for.",
     ),
 )

@@ -147,7 +147,7 @@ class UrdfOptions:
     sensor_noise: float
 
     def report(self) -> UrdfReport:
-        """Return what the URDF holds and lacks."""
+        """Return the contents of the URDF and what is missing."""
         from failuretwin.digital_model.urdf.check import check_urdf
 
         return check_urdf(self.path, self.base, self.tool, 1e-3 * self.sensor_noise)
@@ -245,7 +245,7 @@ def _write_profile(text: str, out: Path) -> None:
 
 
 def _home(text: str | None, report: UrdfReport) -> list[float]:
-    """Return the angles at rest that the user gives [rad or m]; empty where none are given."""
+    """Return the angles at rest of `--home` [rad or m]; empty if it is not given."""
     if text is None:
         return []
     try:

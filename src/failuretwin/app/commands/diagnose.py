@@ -30,7 +30,7 @@ LEARNING = ("out", "independent")
 @click.option(
     "--track",
     is_flag=True,
-    help="Judge each run by what those before it teach of the robot, and go on learning. Give runs "
+    help="Learn the robot run by run: judge each by those before it. Give runs "
     "in their order, the oldest first. Without --calibration it begins with the arm class. The "
     "history is kept beside the calibration, or beside --out (FILE.history.jsonl).",
 )

@@ -1,4 +1,4 @@
-"""`failuretwin calibrate`, `train` and `study`: what is learned, from logs or from the twin."""
+"""`failuretwin calibrate`, `train` and `study`: learning from logs or from the twin."""
 
 from __future__ import annotations
 

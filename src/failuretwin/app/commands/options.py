@@ -25,7 +25,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 PATH = click.Path(path_type=Path)
 EMULATED = "emulated"
-"""Name of an emulated arm, where others name a network."""
+"""Name of an emulated arm, in place of a network."""
 
 
 def file_option(flag: str, metavar: str, text: str, **more: Any) -> Callable[[F], F]:
@@ -136,7 +136,7 @@ def hypotheses_option(text: str) -> Callable[[F], F]:
 
 
 def plugin_option(command: F) -> F:
-    """Add `--plugin`, which makes fault modes known before anything else is read or told."""
+    """Add `--plugin`, which registers fault modes before other options are read."""
 
     def load(context: click.Context, option: click.Parameter, plugins: tuple[str, ...]) -> None:
         if plugins:
@@ -218,8 +218,8 @@ reading_options = gathered(
     file_option(
         "--columns",
         "MAP.toml",
-        "What the columns of a CSV file (or the topics of a bag, or the angles of a LeRobot "
-        "data set) are. If MAP.toml does not exist, a guess is written there for you to check.",
+        "Meaning of the columns of a CSV file (or the topics of a bag, or the angles of a LeRobot "
+        "data set). If MAP.toml does not exist, a guess is written there for you to check.",
     ),
     click.option(
         "--approximate",

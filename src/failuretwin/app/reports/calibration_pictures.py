@@ -1,4 +1,4 @@
-"""Pictures of a calibration: what it expects, what is left, and how a ramp fits."""
+"""Pictures of a calibration: expected errors, residuals, and a ramp."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def load_figure(seen: Predictions, settling: Settling, robot: Robot) -> Figure:
 
 
 def expected_figure(seen: Predictions, robot: Robot) -> Figure:
-    """Return settled errors against what was expected of them, each channel a panel."""
+    """Return settled errors against expected ones, each channel a panel."""
     names, scale, unit = channels(robot, seen.of_motors)
     figure, panels = _panels(names)
     for k, (panel, name) in enumerate(zip(panels, names, strict=True)):
@@ -105,7 +105,7 @@ def _reach(expected: FloatArray, error: FloatArray) -> float:
 
 
 def quantile_figure(seen: Predictions, dof: float, robot: Robot) -> Figure:
-    """Return quantiles of what is left against those of the fitted Student t distribution."""
+    """Return quantiles of the residuals against those of the fitted Student t distribution."""
     from scipy.stats import beta, t
 
     figure, panels = _panels(channels(robot, seen.of_motors)[0])

@@ -1,4 +1,4 @@
-"""What `calibrate` says: tables on the terminal, and one page to judge a calibration by.
+"""Report of `calibrate`: tables on the terminal, and one page.
 
 Parameters with intervals, held-out sessions, what was left out. The page is self-contained HTML and
 needs the extra `plots`.
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 def calibration_parts(found: Calibration, robot: Robot) -> list[Part]:
-    """Return everything that was learned and how far it can be trusted."""
+    """Return all learned parameters and their accuracy on unseen sessions."""
     way = "motor readings" if found.used_readings else "the tool path alone"
     parts: list[Part] = [
         f"{robot.name}: {found.movements} settled movements of {found.runs} runs, {way}\n",
@@ -177,7 +177,7 @@ def write_calibration_page(
 
 
 def _pictures(found: Calibration, runs: xr.Dataset, robot: Robot) -> dict[str, Any]:
-    """Return those pictures that there is something to show in, by name, and what they are of."""
+    """Return the pictures that have data, by name, and the values of their captions."""
     seen, settling = predict(found, runs, robot), settling_of(found, robot)
     ramp = example_transient(found, runs, robot)
     figures = {}
@@ -211,7 +211,7 @@ def taught_section(learned: SelfCalibration, robot: Robot) -> Section:
 
 
 def tracking_line(tracked: Tracked) -> str:
-    """Return what was learned of the runs, in one line."""
+    """Return the changes learned from the runs, in one line."""
     life, history = tracked.life, tracked.history
     parts = [f"{len(tracked.rows)} runs learned", f"{life.arrived} in all"]
     if tracked.known:

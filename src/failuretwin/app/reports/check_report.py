@@ -22,16 +22,15 @@ from failuretwin.digital_model.robot import Robot
 
 ERROR = "steady_state_error"
 CHANGED = 3.0
-"""A zero or a play that differs from that of the check before by so many standard deviations has
-changed."""
+"""Difference to the check before from which a zero or play has changed [standard deviations]."""
 LIMIT = "green rules out what the last column says; smaller errors may be there"
-"""Said of a green light."""
+"""Remark on a green light."""
 LIKELY = 0.05
-"""Motors are named where it is open from this probability on."""
+"""Probability from which motors are named if the result is open."""
 
 
 def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[Part]:
-    """Return what a check found: the light, and what every motor showed."""
+    """Return the result of a check: the light, and the figures of every motor."""
     diagnosis = result.diagnosis
     head = f"{result.light.upper()}: {diagnosis.verdict}"
     if result.light == OPEN and not diagnosis.undecided:
@@ -47,7 +46,7 @@ def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[Part]
 
 
 def closing_lines(result: CheckResult, robot: Robot) -> list[str]:
-    """Return how a check ends: state of the robot, how surely, what to do; as on its page."""
+    """Return the last lines of a check: state, certainty and next step, as on its page."""
     state = robot_state([result.diagnosis], robot)
     return [state.line, f"what to do: {state.step}"]
 
@@ -71,7 +70,7 @@ def _shown(slides: bool) -> tuple[float, str]:
 
 
 def motor_table(result: CheckResult, robot: Robot) -> Table:
-    """Return what each motor showed, zeros and play in degrees, of slides in millimetres."""
+    """Return zero and play of each motor, in degrees, of slides in millimetres."""
     found, shown, rows = result.offsets, result.shown, []
     for k, name in enumerate(robot.motor_names):
         factor, unit = _shown(robot.slides[k])
@@ -114,7 +113,7 @@ def check_record(result: CheckResult, robot: Robot, seconds: float) -> dict[str,
     }
 
 
-# Checks that are kept: the same motions again, and what has changed since.
+# Kept checks: the same motions again, and the changes since.
 
 
 def kept_checks(path: Path) -> list[dict[str, Any]]:
@@ -143,7 +142,7 @@ def keep_check(path: Path, motions: Motions, checks: Sequence[dict[str, Any]]) -
 
 
 def changes(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """Return what has changed since a check of the same motions, a line each."""
+    """Return the changes since a check of the same motions, a line each."""
     lines = []
     for old, new in zip(before["motors"], now["motors"], strict=True):
         for what in ("zero", "play"):

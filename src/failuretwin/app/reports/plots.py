@@ -1,4 +1,4 @@
-"""Pictures of diagnosed runs, and what all pages share. Needs the extra `plots`."""
+"""Pictures of diagnosed runs, and tools of all pages and pictures. Needs the extra `plots`."""
 
 from __future__ import annotations
 

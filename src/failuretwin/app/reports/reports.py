@@ -28,7 +28,7 @@ from failuretwin.inference.explanation import joint_names_in
 from failuretwin.inference.together.fault_course import FaultCourse
 
 MAX_EXPLAINED = 3
-"""Up to so many runs are explained in full on the screen."""
+"""Maximum number of runs that are explained in full on the screen."""
 MARKS = {True: "right", False: "WRONG", None: ""}
 """Marks of verdicts whose truth is known."""
 
@@ -57,9 +57,9 @@ def _diagnosis_row(d: Diagnosis, known: bool) -> list[str]:
 
 
 def state_lines(state: RobotState, together: bool) -> list[str]:
-    """Return the state over several runs and what to do, as the page says them, a line each.
+    """Return the state over several runs and the next step, as on the page, a line each.
 
-    Of one run its diagnosis says both, and of runs that were weighed together `course_lines`.
+    The diagnosis of a single run holds both; for runs weighed together see `course_lines`.
     """
     if together or state.runs < 2:
         return []
@@ -67,7 +67,7 @@ def state_lines(state: RobotState, together: bool) -> list[str]:
 
 
 def course_lines(course: FaultCourse | None, state: RobotState, robot: Robot) -> list[str]:
-    """Return what runs say together of their robot, and what to do; None: each was judged alone."""
+    """Return the verdict over all runs and the next step; None: each was judged alone."""
     if course is None:
         return []
     told = [f"over all runs: {joint_names_in(line, robot)}" for line in course.verdict]
@@ -106,7 +106,7 @@ def _confusion_table(scores: scoring.Scores) -> Table:
     )
 
 
-# What `evaluate` adds.
+# Scores of `evaluate`.
 
 
 def evaluation_parts(evaluation: Evaluation, truth_given: bool) -> list[Part]:
@@ -202,7 +202,7 @@ def comparison_parts(comparison: Comparison) -> list[Part]:
 
 
 def comparison_rows(comparison: Comparison) -> list[tuple[str, str]]:
-    """Return name and value of whatever says how two methods differ."""
+    """Return name and value of each figure of a comparison."""
     split, (a, b) = comparison.split, comparison.as_unknown
     right = (
         f"both {split.both}, only A {split.first_only}, only B {split.second_only}, neither "

@@ -14,7 +14,7 @@ from failuretwin.digital_model.urdf.report import JointReport, UrdfReport
 
 
 def registration_parts(found: Registration) -> list[Part]:
-    """Return what was found and how far it can be trusted."""
+    """Return the fitted parameters and their accuracy."""
     parts: list[Part] = [
         f"{found.profile.name}: {found.poses} settled poses, the tool path alone\n",
         parameter_table(found.parameters, None),
