@@ -22,19 +22,8 @@ from failuretwin.core.errors import InputError
     help="diagnose: react to the fault. feedback: correct the error of the tool, whatever its "
     "cause. open: send each target once.",
 )
-@click.option(
-    "--most-movements",
-    type=click.IntRange(min=1),
-    default=6,
-    help="Maximum number of attempts per target.",
-)
-@click.option(
-    "--ask",
-    "questions",
-    type=click.IntRange(min=0),
-    default=0,
-    help="Maximum number of extra diagnostic movements.",
-)
+@opt.count_option("--most-movements", 6, "Maximum number of attempts per target.", least=1)
+@opt.count_option("--ask questions", 0, "Maximum number of extra diagnostic movements.")
 @click.option(
     "--spare",
     multiple=True,

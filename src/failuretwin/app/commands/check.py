@@ -49,10 +49,8 @@ motion_options = opt.gathered(
     opt.hypotheses_option(
         "Hypotheses to consider. Default: every single fault that shows at rest."
     ),
-    click.option(
-        "--usual",
-        is_flag=True,
-        help="Keep to the ranges of usual movements. Default: to the limits of the joints.",
+    opt.flag_option(
+        "--usual", "Keep to the ranges of usual movements. Default: to the limits of the joints."
     ),
     click.option(
         "--rest",
@@ -99,11 +97,8 @@ MOTIONS = ("written", "motions", "keep", "speed_share", "floor", "radius")
     "File for motions and results of this robot. If it exists, the same motions are made "
     "again (without --seconds) and changes are reported.",
 )
-@click.option(
-    "--further",
-    type=click.IntRange(min=0),
-    default=0,
-    help="Maximum number of further movements if the result is still open.",
+@opt.count_option(
+    "--further", 0, "Maximum number of further movements if the result is still open."
 )
 @opt.json_option("Write one object a line.")
 @opt.report_option("Write index.html: the state of the robot, which motor, how surely, what to do.")
@@ -204,9 +199,7 @@ def _report_logs(
 
 
 @click.command()
-@click.option(
-    "--movements", type=click.IntRange(min=1), default=1000, help="Maximum number of movements."
-)
+@opt.count_option("--movements", 1000, "Maximum number of movements.", least=1)
 @write_option
 @motion_options
 @opt.safety_options

@@ -48,12 +48,7 @@ def import_(out: Path, reading: opt.LogOptions, robot: opt.RobotOptions) -> None
 
 @click.command()
 @opt.file_option("--out", "FILE", "Run set to write (.nc or .zarr).", required=True)
-@click.option(
-    "--runs-per-class",
-    type=click.IntRange(min=1),
-    default=400,
-    help="Runs of each hypothesis; the paper has 400.",
-)
+@opt.count_option("--runs-per-class", 400, "Runs of each hypothesis; the paper has 400.", least=1)
 @opt.hypotheses_option(
     "Hypotheses to simulate, such as healthy,motor_2:stuck. Default: the paper's nine classes."
 )
@@ -77,11 +72,11 @@ def import_(out: Path, reading: opt.LogOptions, robot: opt.RobotOptions) -> None
     "[drift]. Default: the paper's stuck and steady_state_error; the other modes as assumed in "
     "docs/fault_modes.md.",
 )
-@click.option(
+@opt.count_option(
     "--workers",
-    type=click.IntRange(min=1),
-    default=1,
-    help="Processes on this machine to spread the work over; the runs do not depend on it.",
+    1,
+    "Processes on this machine to spread the work over; the runs do not depend on it.",
+    least=1,
 )
 @click.option(
     "--scheduler",

@@ -27,23 +27,20 @@ LEARNING = ("out", "independent")
     metavar="bayes|MODEL|bayes+MODEL|module:Class",
     help="Method of diagnosis: Bayes' rule, a network that `train` wrote, both, or your own class.",
 )
-@click.option(
+@opt.flag_option(
     "--track",
-    is_flag=True,
-    help="Learn the robot run by run: judge each by those before it. Give runs "
+    "Learn the robot run by run: judge each by those before it. Give runs "
     "in their order, the oldest first. Without --calibration it begins with the arm class. The "
     "history is kept beside the calibration, or beside --out (FILE.history.jsonl).",
 )
-@click.option(
+@opt.flag_option(
     "--self-calibrate",
-    is_flag=True,
-    help="Learn from all runs together, all of one robot, how it differs from others of its kind "
+    "Learn from all runs together, all of one robot, how it differs from others of its kind "
     "or from --calibration FILE. No healthy logs are needed.",
 )
-@click.option(
+@opt.flag_option(
     "--independent",
-    is_flag=True,
-    help="With --track or --self-calibrate: faults of one run say nothing of the next, as in a set "
+    "With --track or --self-calibrate: faults of one run say nothing of the next, as in a set "
     "of experiments. Default: faults stay until repaired, and the runs, in their order, get one "
     "verdict in addition to their own.",
 )

@@ -27,10 +27,9 @@ if TYPE_CHECKING:
 )
 @click.option("--name", help="Name of the calibration in results. Default: the file's name.")
 @opt.report_option("Write a page with tables and pictures.")
-@click.option(
+@opt.flag_option(
     "--pool",
-    is_flag=True,
-    help="Each LOG is a calibration of another robot of the kind: write their mean and spread, the "
+    "Each LOG is a calibration of another robot of the kind: write their mean and spread, the "
     "prior of an uncalibrated robot.",
 )
 @opt.reading_options
@@ -131,12 +130,7 @@ def _pool(
     default="cnn",
     help="cnn: convolutional. motorwise: the same network for every motor. lstm: the paper's.",
 )
-@click.option(
-    "--iterations",
-    type=click.IntRange(min=1),
-    default=6000,
-    help="Number of batches, of 64 runs each.",
-)
+@opt.count_option("--iterations", 6000, "Number of batches, of 64 runs each.", least=1)
 @opt.hypotheses_option(
     "Hypotheses that the network distinguishes, such as healthy,motor_2:stuck. Default: the "
     "paper's nine classes."
@@ -190,8 +184,8 @@ def train(
     "Real runs to test on. Default: runs of the physics engine, as a stand-in.",
 )
 @opt.published_labels_option
-@click.option("--quick", is_flag=True, help="A small version of about two minutes.")
-@click.option("--resume", is_flag=True, help="Continue an interrupted study.")
+@opt.flag_option("--quick", "A small version of about two minutes.")
+@opt.flag_option("--resume", "Continue an interrupted study.")
 @opt.robot_options
 def study(
     out: Path,

@@ -116,10 +116,9 @@ def watch(
     "at once: one minute, or until 20 s after the last fault has begun or been repaired, unless "
     "--seconds says otherwise.",
 )
-@click.option(
+@opt.flag_option(
     "--obey",
-    is_flag=True,
-    help="Obey the topic of commands, such as the orders of `failuretwin act`, instead of moving "
+    "Obey the topic of commands, such as the orders of `failuretwin act`, instead of moving "
     "at random.",
 )
 @opt.live_options

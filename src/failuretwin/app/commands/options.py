@@ -33,6 +33,17 @@ def file_option(flag: str, metavar: str, text: str, **more: Any) -> Callable[[F]
     return click.option(*flag.split(), type=PATH, metavar=metavar, help=text, **more)
 
 
+def count_option(flag: str, default: int, text: str, least: int = 0) -> Callable[[F], F]:
+    """Return an option that takes a number of things; the parameter's name may follow the flag."""
+    number = click.IntRange(min=least)
+    return click.option(*flag.split(), type=number, default=default, metavar="N", help=text)
+
+
+def flag_option(flag: str, text: str) -> Callable[[F], F]:
+    """Return an option that takes no value."""
+    return click.option(flag, is_flag=True, help=text)
+
+
 def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F], F]:
     """Return a decorator that adds options; the command gets them as one argument, of `kind`."""
 
@@ -95,7 +106,7 @@ _robot_and_seed = (
         metavar="NAME|PROFILE",
         help="A bundled robot, or the TOML profile of another.",
     ),
-    click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of random draws."),
+    count_option("--seed", 0, "Seed of random draws."),
 )
 robot_options = gathered(RobotOptions, "robot", *_robot_and_seed)
 
@@ -162,10 +173,9 @@ def json_option(text: str) -> Callable[[F], F]:
     return click.option("--json", "json_file", type=PATH, metavar="FILE", help=text)
 
 
-published_labels_option = click.option(
+published_labels_option = flag_option(
     "--published-labels",
-    is_flag=True,
-    help="Take the truth of raw sessions from folder names that end in _label_K and freeze the "
+    "Take the truth of raw sessions from folder names that end in _label_K and freeze the "
     "motor of labels 1-4 from sample 49 on, as the authors of the data did.",
 )
 topics_option = file_option(
@@ -221,10 +231,9 @@ reading_options = gathered(
         "Meaning of the columns of a CSV file (or the topics of a bag, or the angles of a LeRobot "
         "data set). If MAP.toml does not exist, a guess is written there for you to check.",
     ),
-    click.option(
+    flag_option(
         "--approximate",
-        is_flag=True,
-        help="Published paths without commands: accept commands that reproduce the desired path "
+        "Published paths without commands: accept commands that reproduce the desired path "
         "only in the least-squares sense.",
     ),
 )
@@ -268,10 +277,9 @@ SPEED_SHARE = 0.5
 
 def move_option(when: str = "") -> Callable[[F], F]:
     """Return the option `--move`; `when` says which option it belongs to."""
-    return click.option(
+    return flag_option(
         "--move",
-        is_flag=True,
-        help=f"{when}Send orders to a real arm. Without it the orders are only shown. An emulated "
+        f"{when}Send orders to a real arm. Without it the orders are only shown. An emulated "
         "arm needs no --move.",
     )
 
@@ -338,14 +346,11 @@ class ProbeOptions:
 probe_options = gathered(
     ProbeOptions,
     "probe",
-    click.option(
-        "--probe",
-        "probes",
-        type=click.IntRange(min=0),
-        default=0,
-        metavar="N",
-        help="Maximum number of diagnostic movements, each with the way back, while a fault is "
-        "suspected and the arm stands still. Default: 0, nothing moves.",
+    count_option(
+        "--probe probes",
+        0,
+        "Maximum number of diagnostic movements, each with the way back, while a fault is "
+        "suspected and the arm stands still. 0: nothing moves.",
     ),
     click.option(
         "--idle",
