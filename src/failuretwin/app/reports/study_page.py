@@ -15,8 +15,20 @@ from failuretwin.app.terminal import Table
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.store import write_text
-from failuretwin.decision.learned import paper_study as paper
-from failuretwin.decision.learned.paper_study import Spread
+from failuretwin.decision.learned.paper_study import (
+    FEATURES,
+    RATES,
+    REPRODUCING_RATE,
+    Exam,
+    Spread,
+    StudyPlan,
+    Training,
+    accuracies,
+    class_names,
+    mean_confusion,
+    of_kind,
+    ratio_spreads,
+)
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -40,29 +52,13 @@ RATIOS = ("precision", "recall", "F1")
 
 TABLE_3 = {
     "healthy": (NONE, Spread(0.0, 0.0), NONE),
-    "motor_1:steady_state_error": (
-        Spread(1.00, 0.00),
-        Spread(0.52, 0.13),
-        Spread(0.68, 0.11),
-    ),
+    "motor_1:steady_state_error": (Spread(1.00, 0.00), Spread(0.52, 0.13), Spread(0.68, 0.11)),
     "motor_1:stuck": (Spread(0.96, 0.06), Spread(0.84, 0.05), Spread(0.89, 0.04)),
-    "motor_2:steady_state_error": (
-        Spread(0.49, 0.10),
-        Spread(0.70, 0.10),
-        Spread(0.58, 0.10),
-    ),
+    "motor_2:steady_state_error": (Spread(0.49, 0.10), Spread(0.70, 0.10), Spread(0.58, 0.10)),
     "motor_2:stuck": (Spread(0.75, 0.10), Spread(0.92, 0.04), Spread(0.82, 0.06)),
-    "motor_3:steady_state_error": (
-        Spread(0.64, 0.08),
-        Spread(0.70, 0.16),
-        Spread(0.66, 0.08),
-    ),
+    "motor_3:steady_state_error": (Spread(0.64, 0.08), Spread(0.70, 0.16), Spread(0.66, 0.08)),
     "motor_3:stuck": (Spread(0.64, 0.16), Spread(0.72, 0.11), Spread(0.67, 0.11)),
-    "motor_4:steady_state_error": (
-        Spread(0.39, 0.06),
-        Spread(0.68, 0.11),
-        Spread(0.50, 0.07),
-    ),
+    "motor_4:steady_state_error": (Spread(0.39, 0.06), Spread(0.68, 0.11), Spread(0.50, 0.07)),
     "motor_4:stuck": (Spread(0.49, 0.11), Spread(0.46, 0.15), Spread(0.47, 0.13)),
 }
 """Precision, recall and F1 of each class on 90 real runs, in the order of the paper's rows."""
@@ -75,18 +71,18 @@ SETS = tuple(COLOURS)
 
 
 def training_figure(
-    trainings: Sequence[paper.Training], learning_rate: float, iterations: Sequence[int]
+    trainings: Sequence[Training], learning_rate: float, iterations: Sequence[int]
 ) -> Figure:
     """Return accuracy by iterations, one panel per feature set, error bars of one deviation.
 
     Dotted lines show the published accuracies of augmented features.
     """
     figure = plots.new_figure(11.0, 4.2)
-    panels = figure.subplots(1, len(paper.FEATURES), sharey=True)
-    for panel, features in zip(panels, paper.FEATURES, strict=True):
-        repeats = paper.of_kind(trainings, features, learning_rate)
+    panels = figure.subplots(1, len(FEATURES), sharey=True)
+    for panel, features in zip(panels, FEATURES, strict=True):
+        repeats = of_kind(trainings, features, learning_rate)
         for name in SETS:
-            rows = paper.accuracies(repeats, name)
+            rows = accuracies(repeats, name)
             panel.errorbar(
                 iterations,
                 [100.0 * row.mean for row in rows],
@@ -153,59 +149,55 @@ def confusion_figure(shares: Mapping[str, FloatArray], classes: Sequence[str]) -
 
 
 def write_study_page(
-    trainings: Sequence[paper.Training],
-    plan: paper.StudyPlan,
-    robot: Robot,
-    test: paper.Exam,
-    path: Path,
+    trainings: Sequence[Training], plan: StudyPlan, robot: Robot, test: Exam, path: Path
 ) -> None:
     """Write the page with tables and figures of a finished study."""
-    names = paper.class_names(robot)
+    names = class_names(robot)
     values = {
         "plan": plan,
         "robot": robot.name,
         "test": test,
-        "full": plan == paper.StudyPlan(plan.seed),
+        "full": plan == StudyPlan(plan.seed),
         "accuracies": _table_2(trainings, test),
         "progress": _progress(trainings, plan),
-        "classes": [_table_3(trainings, features, names) for features in paper.FEATURES],
-        "rates": paper.RATES,
+        "classes": [_table_3(trainings, features, names) for features in FEATURES],
+        "rates": RATES,
         "pictures": _pictures(trainings, plan, robot, test),
         "minutes": sum(training.seconds for training in trainings) / 60.0,
     }
     write_text(plots.render_page("study.html.j2", values), path)
 
 
-def _table_2(trainings: Sequence[paper.Training], test: paper.Exam) -> Table:
+def _table_2(trainings: Sequence[Training], test: Exam) -> Table:
     """Return one row for the paper and one per kind of training."""
     stand_in = "" if test.real else " (stand-in)"
     rows = [("the paper", *(percent(TABLE_2[name]) for name in SETS))]
-    for features in reversed(paper.FEATURES):
-        for rate in paper.RATES:
-            repeats = paper.of_kind(trainings, features, rate)
-            *seen, tested = (percent(paper.accuracies(repeats, name)[-1]) for name in SETS)
+    for features in reversed(FEATURES):
+        for rate in RATES:
+            repeats = of_kind(trainings, features, rate)
+            *seen, tested = (percent(accuracies(repeats, name)[-1]) for name in SETS)
             name = f"{features} features, learning rate {rate:g}"
             rows.append((name, *seen, tested + stand_in))
     return Table(("", *SETS), rows)
 
 
-def _progress(trainings: Sequence[paper.Training], plan: paper.StudyPlan) -> Table:
+def _progress(trainings: Sequence[Training], plan: StudyPlan) -> Table:
     """Return accuracies at every checkpoint, one row per kind of training and set."""
     rows = [
         (
             f"{features} features, {rate:g}, {name}",
-            *map(percent, paper.accuracies(paper.of_kind(trainings, features, rate), name)),
+            *map(percent, accuracies(of_kind(trainings, features, rate), name)),
         )
-        for features in paper.FEATURES
-        for rate in paper.RATES
+        for features in FEATURES
+        for rate in RATES
         for name in SETS
     ]
     return Table(("features, learning rate, runs", *map(str, plan.checkpoints)), rows)
 
 
-def _table_3(trainings: Sequence[paper.Training], features: str, names: Sequence[str]) -> Table:
+def _table_3(trainings: Sequence[Training], features: str, names: Sequence[str]) -> Table:
     """Return ratios of each class at the reproducing rate, with those of the paper."""
-    ours = paper.ratio_spreads(paper.of_kind(trainings, features, paper.REPRODUCING_RATE))
+    ours = ratio_spreads(of_kind(trainings, features, REPRODUCING_RATE))
     rows = [
         (plots.plain(name), *map(text, ours[names.index(name)]), *map(text, published))
         for name, published in TABLE_3.items()
@@ -229,20 +221,17 @@ def percent(value: Spread) -> str:
 
 
 def _pictures(
-    trainings: Sequence[paper.Training], plan: paper.StudyPlan, robot: Robot, test: paper.Exam
+    trainings: Sequence[Training], plan: StudyPlan, robot: Robot, test: Exam
 ) -> dict[str, str]:
     shares = {
-        f"{features} features": paper.mean_confusion(
-            paper.of_kind(trainings, features, paper.REPRODUCING_RATE)
-        )
-        for features in paper.FEATURES
+        f"{features} features": mean_confusion(of_kind(trainings, features, REPRODUCING_RATE))
+        for features in FEATURES
     }
     figures = {
-        f"training {rate:g}": training_figure(trainings, rate, plan.checkpoints)
-        for rate in paper.RATES
+        f"training {rate:g}": training_figure(trainings, rate, plan.checkpoints) for rate in RATES
     }
     figures["path"] = path_figure(test.runs, 0, DigitalTwin(robot))
     figures["confusion"] = confusion_figure(
-        shares, [plots.plain(name) for name in paper.class_names(robot)]
+        shares, [plots.plain(name) for name in class_names(robot)]
     )
     return {name: plots.png(figure) for name, figure in figures.items()}
