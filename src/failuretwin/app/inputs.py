@@ -6,11 +6,10 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.app.commands.options import LogOptions
 from failuretwin.app.terminal import tell
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, needs_extra
@@ -21,7 +20,6 @@ from failuretwin.data_knowledge.readers.column_guess import column_map_text
 from failuretwin.data_knowledge.readers.column_map import CORRECTION, read_column_map
 from failuretwin.data_knowledge.readers.lerobot import LeRobotAngles, is_lerobot, lerobot_map_text
 from failuretwin.data_knowledge.readers.matlab import RECOVERY_ERROR, RECOVERY_WORST
-from failuretwin.data_knowledge.readers.raw_sessions import As
 from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import write_text
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
@@ -43,19 +41,18 @@ REPORTED_ERROR_M = 1e-6
 """Error of recovered commands from which it is reported [m]; exact ones are below 1e-9."""
 
 
-def read_inputs(reading: LogOptions, robot: Robot) -> xr.Dataset:
-    """Return the runs of all logs as one run set.
+def read_inputs(
+    logs: Sequence[Path], robot: Robot, options: ReadOptions, columns: Path | None
+) -> xr.Dataset:
+    """Return the runs of all logs as one run set, read with the map of `columns` if there is one.
 
     Raises:
         InputError: If they cannot be read.
     """
-    options = ReadOptions(
-        cast(As, reading.how), reading.published_labels, approximate=reading.approximate
-    )
     correction = None
-    if reading.columns is not None:
-        options, correction = _with_map(options, reading.columns, reading.logs, robot)
-    runs = read_runs(list(reading.logs), robot, options)
+    if columns is not None:
+        options, correction = _with_map(options, columns, logs, robot)
+    runs = read_runs(list(logs), robot, options)
     if correction is not None:
         runs = correction.runs(runs)
     error = float(runs.attrs.get(RECOVERY_ERROR, 0.0))

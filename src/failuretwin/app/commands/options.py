@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 from click.core import ParameterSource
@@ -17,6 +17,7 @@ from failuretwin.core.errors import InputError
 if TYPE_CHECKING:
     import xarray as xr
 
+    from failuretwin.data_knowledge.readers.raw_sessions import As
     from failuretwin.decision.acting.safety import SafetyGate
     from failuretwin.decision.test_motions.probing import ProbeRules
     from failuretwin.digital_model.calibrated_robot import CalibratedRobot
@@ -209,7 +210,9 @@ class LogOptions:
         """Return the runs of all logs as one run set."""
         from failuretwin.app.inputs import read_inputs
 
-        return read_inputs(self, robot)
+        how = cast("As", self.how)
+        options = ft.ReadOptions(how, self.published_labels, approximate=self.approximate)
+        return read_inputs(self.logs, robot, options, self.columns)
 
 
 reading_options = gathered(
