@@ -194,12 +194,16 @@ def connect(
         ros_link = RosCommander if takes_orders else RosSource
         diagnostics = RosSink(DiagnosticsWriter(robot, topics), transport)
         return ros_link(robot, topics, transport), [diagnostics]
-    if OWN_CLASS.fullmatch(text) and not Path(text).exists():
+    if Path(text).exists():
+        source = None if takes_orders else _log(text, robot, topics, Pace(live.speed))
+    elif OWN_CLASS.fullmatch(text):
         sys.path.insert(0, "")  # the user's module may lie in the current folder
         source = source_from_text(text, robot)
+        if takes_orders and not (hasattr(source, "send") and hasattr(source, "standing")):
+            source = None
     else:
-        source = _log(text, robot, topics, Pace(live.speed))
-    if takes_orders and not (hasattr(source, "send") and hasattr(source, "standing")):
+        raise InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
+    if source is None:
         raise InputError(
             f"source {text!r} can only be listened to, but --probe orders movements. Expected "
             f"{PLACES}, or MODULE:CLASS of a Commander; or leave --probe out."
@@ -221,8 +225,6 @@ def _emulated(robot: Robot, live: LiveOptions, seed: int, takes_orders: bool) ->
 def _log(text: str, robot: Robot, topics: RosTopics, pace: Pace) -> Source:
     from failuretwin.connection.links.replay import replay
 
-    if not Path(text).exists():
-        raise InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
     recorded = BagTopics(topics.command, topics.tool or None, topics.position or None)
     return replay(Path(text), robot, pace, None if topics == RosTopics() else recorded)
 
