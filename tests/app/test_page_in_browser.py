@@ -32,7 +32,7 @@ document.title = JSON.stringify({
   wide: document.documentElement.scrollWidth, inner: window.innerWidth,
   below: place[1].top >= place[0].bottom, beside: place[1].left >= place[0].right,
   step: at('.step').bottom, size: parseFloat(getComputedStyle(document.body).fontSize),
-  arm: at('svg.arm').height, folded: folded});
+  arm: at('img.arm').height, folded: folded});
 parent.postMessage(document.title, '*');
 </script>"""
 FRAME = """<!doctype html><pre id="found"></pre>

@@ -75,32 +75,20 @@ def emulated_arm(
     return CommandedArm(emulation_with(faults, calibrated(robot), seed))
 
 
-def emulation_of(
-    robot: Robot, live: LiveOptions, seed: int, calibration: str | None = None
-) -> Emulation:
-    """Return the settings of an emulated arm with the faults of the command line.
-
-    Args:
-        robot: The robot, without faults.
-        live: Its faults.
-        seed: Seed of all random draws.
-        calibration: Its healthy behaviour; None: the known one of this robot.
+def known_arm(robot: Robot, calibration: Path | None = None) -> CalibratedRobot:
+    """Return an emulated robot; None: with the calibration of its profile, or the ideal twin.
 
     Raises:
-        InputError: If a fault or the imperfections cannot be read.
+        InputError: If the calibration cannot be read.
     """
-    own = "none" if robot.imperfections_file is None else robot.name
-    return emulation_with(live.faults, load_calibration(calibration or own, robot), seed)
+    ideal = calibration is None and robot.imperfections_file is None
+    return load_calibration("none" if ideal else calibration, robot)
 
 
 def emulation_with(faults: Sequence[str], known: CalibratedRobot, seed: int) -> Emulation:
-    """Return the settings of an emulated arm with faults.
+    """Return the settings of an emulated arm with faults, written as for `emulated_arm`.
 
-    Args:
-        faults: MOTOR:MODE[=SIZE][@START[-END]], the size in the unit of the mode; for a stuck motor
-            its position. Without a start a fault is present from the beginning.
-        known: The robot and its healthy behaviour.
-        seed: Seed of all random draws.
+    The size of a stuck motor is its position. Without a start a fault begins at once.
 
     Raises:
         InputError: If a fault cannot be read, its mode takes no size, or one mode has two sizes.
@@ -149,13 +137,9 @@ def is_moved(arm: ArmOptions) -> bool:
     Raises:
         InputError: If its place is none of `PLACES`.
     """
-    return arm.move or not _is_real(arm.place)
-
-
-def _is_real(place: str) -> bool:
-    if place != EMULATED and not is_network(place):
-        raise InputError(f"--on is {place!r}, expected {PLACES}.")
-    return place != EMULATED
+    if arm.place != EMULATED and not is_network(arm.place):
+        raise InputError(f"--on is {arm.place!r}, expected {PLACES}.")
+    return arm.move or arm.place == EMULATED
 
 
 def commander_of(arm: ArmOptions, known: CalibratedRobot, seed: int, stack: ExitStack) -> Commander:
@@ -164,15 +148,20 @@ def commander_of(arm: ArmOptions, known: CalibratedRobot, seed: int, stack: Exit
     Raises:
         InputError: If it cannot be reached or its place is none of `PLACES`.
     """
-    if not _is_real(arm.place):
+    is_moved(arm)
+    if arm.place == EMULATED:
         return stack.enter_context(emulated_arm(known, arm.faults, seed))
-    if arm.faults:
-        raise InputError(
-            f"--fault is of an emulated arm, but --on is {arm.place!r}. Leave it out, or act on "
-            f"{EMULATED!r}."
-        )
+    _refuse_faults(arm.faults, arm.place)
     transport = stack.enter_context(open_transport(arm.place))
     return RosCommander(known.robot, load_topics(arm.topics), transport)
+
+
+def _refuse_faults(faults: Sequence[str], place: str) -> None:
+    if faults:
+        raise InputError(
+            f"--fault is of an emulated arm, but the arm is {place!r}. Leave it out, or name "
+            f"{EMULATED!r}."
+        )
 
 
 # Arms that `watch` listens to.
@@ -189,70 +178,55 @@ def connect(
 ) -> tuple[Source, list[Sink]]:
     """Return the source that a SOURCE on the command line names, and the sinks of its network.
 
-    Args:
-        text: One of `SOURCES`.
-        robot: The robot.
-        live: Topics, faults, pace and length.
-        seed: Seed of all random draws.
-        stack: Closes everything in the end.
-        takes_orders: Whether the source must be a `Commander`. An emulated arm then works in
-            shifts, and takes orders in its breaks.
+    The stack closes them. With `takes_orders` the source must be a `Commander`; an emulated arm
+    then works in shifts, and takes orders in its breaks.
 
     Raises:
-        InputError: If it does not exist, cannot be reached, is none of these, takes no orders, or
-            gets options that only an emulated robot has.
+        InputError: If it does not exist, cannot be reached, is none of `SOURCES`, takes no orders,
+            or gets options that only an emulated robot has.
     """
     if text == EMULATED:
         return stack.enter_context(_emulated(robot, live, seed, takes_orders)), []
-    if live.faults:
-        raise InputError(
-            f"--fault is of an emulated robot, but the source is {text!r}. Leave it out, or watch "
-            f"{EMULATED!r}."
-        )
+    _refuse_faults(live.faults, text)
     topics = load_topics(live.topics)
     if is_network(text):
         transport = stack.enter_context(open_transport(text))
         ros_link = RosCommander if takes_orders else RosSource
         diagnostics = RosSink(DiagnosticsWriter(robot, topics), transport)
         return ros_link(robot, topics, transport), [diagnostics]
-    if OWN_CLASS.fullmatch(text) and not Path(text).exists():
+    if Path(text).exists():
+        source = None if takes_orders else _log(text, robot, topics, Pace(live.speed))
+    elif OWN_CLASS.fullmatch(text):
         sys.path.insert(0, "")  # the user's module may lie in the current folder
-        source = stack.enter_context(source_from_text(text, robot))
+        source = source_from_text(text, robot)
         if takes_orders and not (hasattr(source, "send") and hasattr(source, "standing")):
-            raise _only_listens(text)
-        return source, []
-    return stack.enter_context(_log(text, robot, live, takes_orders)), []
-
-
-def _only_listens(text: str) -> InputError:
-    return InputError(
-        f"source {text!r} can only be listened to, but --probe orders movements. Expected "
-        f"{PLACES}, or MODULE:CLASS of a Commander; or leave --probe out."
-    )
+            source = None
+    else:
+        raise InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
+    if source is None:
+        raise InputError(
+            f"source {text!r} can only be listened to, but --probe orders movements. Expected "
+            f"{PLACES}, or MODULE:CLASS of a Commander; or leave --probe out."
+        )
+    return stack.enter_context(source), []
 
 
 def _emulated(robot: Robot, live: LiveOptions, seed: int, takes_orders: bool) -> Source:
     from failuretwin.connection.commanded_arm import OperatedArm, Shifts
     from failuretwin.connection.emulated_arm import emulated
 
-    emulation, pace = emulation_of(robot, live, seed), Pace(live.speed)
-    length = live.seconds or math.inf
+    emulation = emulation_with(live.faults, known_arm(robot), seed)
+    pace, length = Pace(live.speed), live.seconds or math.inf
     if takes_orders:
         return OperatedArm(emulation, Shifts(duration_s=length), pace)
     return emulated(emulation, pace, length)
 
 
-def _log(text: str, robot: Robot, live: LiveOptions, takes_orders: bool) -> Source:
+def _log(text: str, robot: Robot, topics: RosTopics, pace: Pace) -> Source:
     from failuretwin.connection.links.replay import replay
 
-    path, topics = Path(text), load_topics(live.topics)
-    if not path.exists():
-        raise InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
-    if takes_orders:
-        raise _only_listens(text)
     recorded = BagTopics(topics.command, topics.tool or None, topics.position or None)
-    named = None if topics == RosTopics() else recorded
-    return replay(path, robot, Pace(live.speed), named)
+    return replay(Path(text), robot, pace, None if topics == RosTopics() else recorded)
 
 
 # Motors and numbers in option texts.
@@ -293,11 +267,7 @@ def spared_of(
 ) -> FloatArray | None:
     """Return the weights of motors to spare, (motor,); None if no motor is spared.
 
-    Args:
-        texts: MOTOR or MOTOR=WEIGHT; replaces the weight from the history for this motor.
-        history: CAL.history.jsonl; None: no history.
-        model: The robot.
-        tell: Called with the wear found in the history.
+    Texts (MOTOR or MOTOR=WEIGHT) replace the weights from the history, whose wear is told.
 
     Raises:
         InputError: If a motor is unknown, a weight is no number, or the history cannot be read.

@@ -25,7 +25,14 @@ from failuretwin.app.commands.live import emulate, watch
 from failuretwin.app.terminal import tell
 from failuretwin.core.errors import FailureTwinError
 
-CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100, "show_default": True}
+RENAMED = {"imperfections": "calibration", "plot": "report"}
+"""Options that still work under an old name."""
+CONTEXT = {
+    "help_option_names": ["-h", "--help"],
+    "max_content_width": 100,
+    "show_default": True,
+    "token_normalize_func": lambda name: RENAMED.get(name, name),
+}
 
 
 @click.group(context_settings=CONTEXT)

@@ -9,12 +9,11 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from failuretwin.app.arms import emulation_of
 from failuretwin.app.commands.options import LiveOptions
-from failuretwin.app.terminal import tell
+from failuretwin.app.terminal import tell, until_interrupted
 from failuretwin.connection.commanded_arm import CommandedArm
-from failuretwin.connection.emulated_arm import emulated
-from failuretwin.connection.links.base import CommandSent, Order, Reading, Sink, Source
+from failuretwin.connection.emulated_arm import Emulation, emulated
+from failuretwin.connection.links.base import CommandSent, Order, Reading, Sink
 from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace
 from failuretwin.connection.links.ros_link import (
     NETWORKS,
@@ -26,90 +25,54 @@ from failuretwin.connection.links.ros_link import (
 from failuretwin.connection.links.ros_messages import RosWriter
 from failuretwin.connection.links.ros_topics import load_topics
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault, state_at
 
 FILE_S, AFTER_S = 60.0, 20.0
-"""Default length of a recording, and its least length after the last start or end of a fault
+"""Default length of a recording, and its minimum length after the last start or end of a fault
 [s]."""
 POLL_S = 0.01
 """Longest wait for the arm before commands are read again [s]."""
 
 
-def obey(target: str, robot: Robot, live: LiveOptions, calibration: str | None, seed: int) -> None:
-    """Publish readings and carry out the commands of the network, until interrupted.
-
-    Args:
-        target: The network, such as ``ros1``.
-        robot: The robot.
-        live: Topics, faults, pace and length.
-        calibration: Its healthy behaviour; None: the known one of this robot.
-        seed: Seed of all random draws.
+def obey(target: str, emulation: Emulation, live: LiveOptions) -> None:
+    """Publish readings and carry out the commands of a network, until interrupted.
 
     Raises:
         InputError: If the target is no network, or cannot be reached.
     """
     if not is_network(target):
         raise InputError(f"--obey needs a network to obey, but --to is {target!r}.")
-    topics = load_topics(live.topics)
-    arm = CommandedArm(emulation_of(robot, live, seed, calibration), Pace(live.speed))
-    with open_transport(target) as transport:
-        sink = RosSink(RosWriter(robot, topics), transport)
-        orders = RosSource(robot, topics, transport)
+    topics, arm = load_topics(live.topics), CommandedArm(emulation, Pace(live.speed))
+    with open_transport(target) as transport, until_interrupted():
+        sink = RosSink(RosWriter(emulation.robot, topics), transport)
+        orders = RosSource(emulation.robot, topics, transport)
         tell("an emulated robot obeys; stop with Ctrl-C")
-        try:
-            now, zero = 0.0, time.time()
-            while now < (live.seconds or math.inf):
-                event = arm.poll(POLL_S)
-                if isinstance(event, Reading):
-                    now = event.time
-                    sink.put(replace(event, time=event.time + zero))
-                while (heard := orders.poll(0.0)) is not None:
-                    if isinstance(heard, CommandSent):
-                        arm.send(Order(heard.target, heard.duration))
-        except KeyboardInterrupt:
-            tell("stopped")
+        now, zero = 0.0, time.time()
+        while now < (live.seconds or math.inf):
+            event = arm.poll(POLL_S)
+            if isinstance(event, Reading):
+                now = event.time
+                sink.put(replace(event, time=event.time + zero))
+            while (heard := orders.poll(0.0)) is not None:
+                if isinstance(heard, CommandSent):
+                    arm.send(Order(heard.target, heard.duration))
 
 
-def play(target: str, robot: Robot, live: LiveOptions, calibration: str | None, seed: int) -> None:
-    """Publish or record a robot that moves at random; arguments as in `obey`.
+def play(target: str, emulation: Emulation, live: LiveOptions) -> None:
+    """Publish or record a robot that moves at random.
 
     Raises:
         InputError: If the target is no network and no .mcap file, or fails.
     """
-    emulation = emulation_of(robot, live, seed, calibration)
     zero, on_network = time.time(), is_network(target)
     if not on_network and Path(target).suffix != ".mcap":
         raise InputError(f"--to is {target!r}, expected {NETWORKS} or a file that ends in .mcap.")
     length = live.seconds or (math.inf if on_network else _file_length(emulation.schedule))
     pace = Pace(live.speed if on_network else AS_FAST_AS_POSSIBLE)
-    source = emulated(emulation, pace, length, zero)
-    with ExitStack() as stack:
-        sink = _sink(target, robot, live, stack)
+    source, state, trouble = emulated(emulation, pace, length, zero), "", ""
+    with ExitStack() as stack, until_interrupted():
+        sink = _sink(target, emulation, live, stack)
         stack.enter_context(source)
-        _pass_on(source, sink, emulation.schedule, zero, robot)
-    if sink.trouble:
-        raise InputError(sink.trouble)
-    if source.ended and not on_network:
-        tell(f"{length:g} s written to {target}")
-
-
-def _sink(target: str, robot: Robot, live: LiveOptions, stack: ExitStack) -> Sink:
-    """Return the network or recording that an emulated robot publishes to; the stack closes it."""
-    if is_network(target):
-        transport = stack.enter_context(open_transport(target))
-        return RosSink(RosWriter(robot, load_topics(live.topics)), transport)
-    from failuretwin.connection.links.recorder import Recorder
-
-    return stack.enter_context(Recorder(Path(target), robot))
-
-
-def _pass_on(
-    source: Source, sink: Sink, schedule: Sequence[ScheduledFault], zero: float, robot: Robot
-) -> None:
-    """Pass all events on and tell the user of faults, until the source ends."""
-    state, trouble = "", ""
-    try:
         while not source.ended:
             event = source.poll(1.0)
             if event is None:
@@ -118,12 +81,24 @@ def _pass_on(
             if sink.trouble != trouble:
                 trouble = sink.trouble
                 tell(trouble or "going on")
-            now = state_at(schedule, event.time - zero, robot.motor_names)
+            now = state_at(emulation.schedule, event.time - zero, emulation.robot.motor_names)
             if now != state:
-                tell(f"{event.time - zero:8.1f} s  {now}")
                 state = now
-    except KeyboardInterrupt:
-        tell("stopped")
+                tell(f"{event.time - zero:8.1f} s  {state}")
+    if sink.trouble:
+        raise InputError(sink.trouble)
+    if source.ended and not on_network:
+        tell(f"{length:g} s written to {target}")
+
+
+def _sink(target: str, emulation: Emulation, live: LiveOptions, stack: ExitStack) -> Sink:
+    """Return the network or recording that an emulated robot publishes to; the stack closes it."""
+    if is_network(target):
+        transport = stack.enter_context(open_transport(target))
+        return RosSink(RosWriter(emulation.robot, load_topics(live.topics)), transport)
+    from failuretwin.connection.links.recorder import Recorder
+
+    return stack.enter_context(Recorder(Path(target), emulation.robot))
 
 
 def _file_length(schedule: Sequence[ScheduledFault]) -> float:

@@ -1,4 +1,4 @@
-"""From what stands on the command line to runs."""
+"""From options of the command line to runs, hypotheses and diagnosers."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.app.commands.options import LogOptions
 from failuretwin.app.terminal import tell
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, needs_extra
@@ -21,7 +20,6 @@ from failuretwin.data_knowledge.readers.column_guess import column_map_text
 from failuretwin.data_knowledge.readers.column_map import CORRECTION, read_column_map
 from failuretwin.data_knowledge.readers.lerobot import LeRobotAngles, is_lerobot, lerobot_map_text
 from failuretwin.data_knowledge.readers.matlab import RECOVERY_ERROR, RECOVERY_WORST
-from failuretwin.data_knowledge.readers.raw_sessions import As
 from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import write_text
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
@@ -40,19 +38,21 @@ if TYPE_CHECKING:
     from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
 
 REPORTED_ERROR_M = 1e-6
-"""Error of recovered commands that the user is told of [m]; exact ones are below 1e-9."""
+"""Error of recovered commands from which it is reported [m]; exact ones are below 1e-9."""
 
 
-def read_inputs(sources: Sequence[Path], robot: Robot, reading: LogOptions) -> xr.Dataset:
-    """Return the runs of all inputs as one run set."""
+def read_inputs(
+    logs: Sequence[Path], robot: Robot, options: ReadOptions, columns: Path | None
+) -> xr.Dataset:
+    """Return the runs of all logs as one run set, read with the map of `columns` if there is one.
+
+    Raises:
+        InputError: If they cannot be read.
+    """
     correction = None
-    options = ReadOptions(
-        cast(As, reading.how), reading.published_labels, approximate=reading.approximate
-    )
-    if reading.columns is not None:
-        options = _with_map(options, reading.columns, sources, robot)
-        correction = _correction(reading.columns, robot)
-    runs = read_runs(list(sources), robot, options)
+    if columns is not None:
+        options, correction = _with_map(options, columns, logs, robot)
+    runs = read_runs(list(logs), robot, options)
     if correction is not None:
         runs = correction.runs(runs)
     error = float(runs.attrs.get(RECOVERY_ERROR, 0.0))
@@ -65,24 +65,14 @@ def read_inputs(sources: Sequence[Path], robot: Robot, reading: LogOptions) -> x
     return runs
 
 
-def _correction(path: Path, robot: Robot) -> LogCorrection | None:
-    """Return how a wrong set-up of the log is undone, where a map says it."""
-    table = read_toml(path).get(CORRECTION)
-    if table is None:
-        return None
-    where = f"{path}: {CORRECTION}"
-    stated = from_table(CorrectionTable, table, where)
-    return LogCorrection.from_file(stated, len(robot.motors), where)
-
-
 SAME_PLACE_M = 1e-6
-"""Error by which a tool that is computed from motor readings may be off them: rounding [m]."""
+"""Rounding error of a tool path that is computed from motor readings [m]."""
 
 
 def with_doubts(
     diagnoses: Sequence[Diagnosis], runs: xr.Dataset, twin: DigitalTwin
 ) -> list[Diagnosis]:
-    """Return diagnoses with what the way doubts them in which the logs were made."""
+    """Return diagnoses with a caveat if the tool path was computed from motor readings."""
     if not _is_computed(runs, twin):
         return list(diagnoses)
     return [with_reading_doubt(one, one.diagnosis or "") for one in diagnoses]
@@ -99,7 +89,7 @@ def _is_computed(runs: xr.Dataset, twin: DigitalTwin) -> bool:
 
 
 def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
-    """Tell the user where simulated runs lack the imperfections (by name) that are expected."""
+    """Warn if simulated runs have other imperfections than the expected ones (by name)."""
     try:
         made_with = json.loads(runs.attrs["configuration"])["imperfections"]
     except (KeyError, TypeError, ValueError):  # a run set of other people may say anything there
@@ -113,39 +103,49 @@ def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
 
 
 def _with_map(
-    options: ReadOptions, path: Path, sources: Sequence[Path], robot: Robot
-) -> ReadOptions:
-    """Return the options with a map of columns, topics or the angles of a LeRobot data set.
+    options: ReadOptions, path: Path, logs: Sequence[Path], robot: Robot
+) -> tuple[ReadOptions, LogCorrection | None]:
+    """Return the options with a map of columns, topics or angles, and the correction in it.
 
-    Where there is no such file yet, a guess is written and shown, and the work stops.
+    Raises:
+        InputError: If the map cannot be read. If there is no such file yet, a guess is written.
     """
-    if path.exists():
-        table = read_toml(path)
-        if "topics" in table:
-            topics = from_table(BagTopics, table["topics"], f"{path}: topics")
-            return replace(options, topics=topics)
-        if "lerobot" in table:
-            angles = from_table(LeRobotAngles, table["lerobot"], f"{path}: lerobot")
-            return replace(options, lerobot=angles)
-        if set(table) == {CORRECTION}:
-            return options
-        return replace(options, columns=read_column_map(path, robot))
-    log = next((s for s in sources if is_lerobot(s) or (s.suffix == ".csv" and s.is_file())), None)
+    if not path.exists():
+        raise _guessed(path, logs, robot)
+    table, correction = read_toml(path), None
+    if CORRECTION in table:
+        where = f"{path}: {CORRECTION}"
+        stated = from_table(CorrectionTable, table[CORRECTION], where)
+        correction = LogCorrection.from_file(stated, len(robot.motors), where)
+    if "topics" in table:
+        topics = from_table(BagTopics, table["topics"], f"{path}: topics")
+        options = replace(options, topics=topics)
+    elif "lerobot" in table:
+        angles = from_table(LeRobotAngles, table["lerobot"], f"{path}: lerobot")
+        options = replace(options, lerobot=angles)
+    elif set(table) != {CORRECTION}:
+        options = replace(options, columns=read_column_map(path, robot))
+    return options, correction
+
+
+def _guessed(path: Path, logs: Sequence[Path], robot: Robot) -> InputError:
+    """Write and show a guessed map; return the request to check it."""
+    log = next((s for s in logs if is_lerobot(s) or (s.suffix == ".csv" and s.is_file())), None)
     if log is None:
-        raise InputError(
+        return InputError(
             f"{path}: does not exist, and no CSV file or LeRobot data set is given to guess it "
             "from."
         )
     text = (lerobot_map_text if is_lerobot(log) else column_map_text)(log, robot)
     write_text(text, path)
     tell(text)
-    raise InputError(
+    return InputError(
         f"{path} did not exist. The guess above has been written there and nothing was read: check "
         "every line, correct it, and run the same command again."
     )
 
 
-# What commands need to know of the extra `learn`.
+# The extra `learn`.
 
 
 def check_learning() -> None:
@@ -156,19 +156,19 @@ def check_learning() -> None:
     del sklearn, torch
 
 
-# Which diagnoser the user asks for.
+# Diagnoser of `--method`.
 
 BAYES = "bayes"
 """Name of the method that needs no file."""
 BLEND = f"{BAYES}+"
-"""What stands before the file of a network that is blended with it."""
+"""Prefix of the file of a network that is blended with it."""
 
 
 def parse_cli_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ...] | None:
-    """Return the hypotheses that the user names, separated by commas; None where none are.
+    """Return the hypotheses of a text separated by commas; None: the default ones.
 
     Raises:
-        InputError: If one cannot be read, or there is only one, which would always be certain.
+        InputError: If one cannot be read, or there is only one, which is always certain.
     """
     if text is None:
         return None
@@ -187,7 +187,7 @@ def parse_cli_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ..
 
 
 def chosen_diagnoser(method: str, bayes: BayesDiagnoser) -> Diagnoser:
-    """Return the diagnoser that the user names.
+    """Return the diagnoser of `--method`.
 
     Args:
         method: ``bayes``, the file of a network, ``bayes+`` and that file, or ``module:Class`` of
@@ -228,7 +228,7 @@ def _pooled(network: LearnedDiagnoser, bayes: BayesDiagnoser, path: Path) -> Hyb
 def expected_name(diagnoser: Diagnoser) -> str:
     """Return the name of the healthy behaviour that a diagnoser expects.
 
-    A class of the user expects nothing that is known here.
+    The expectation of a user's class is unknown.
     """
     encoder = getattr(diagnoser, "encoder", None)
     if encoder is None:

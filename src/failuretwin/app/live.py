@@ -7,7 +7,8 @@ import time
 from collections import Counter, deque
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from datetime import date
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console, Group, RenderableType
@@ -29,8 +30,11 @@ from failuretwin.connection.links.statuses import (
 )
 from failuretwin.core.errors import counted
 from failuretwin.core.foreign import printable
-from failuretwin.decision.streaming.monitor import FaultMonitor, Fit
+from failuretwin.decision.streaming.alarm_rule import movements_to_tell
+from failuretwin.decision.streaming.monitor import FaultMonitor
 from failuretwin.decision.test_motions.probing import Prober
+from failuretwin.digital_model.arm_classes import GENERIC_NAME
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.inference.calibration_fit import MISFIT
 from failuretwin.inference.explanation import percent
 
@@ -39,39 +43,35 @@ REFRESH_S = 0.25
 POLL_S = 0.1
 """Longest wait for an event [s]."""
 LATE_S = 0.3
-"""A command that comes later than this spoils the diagnosis, and the user is told [s]."""
+"""Delay of a command from which it spoils the diagnosis and is reported [s]."""
 
 
 class _Screen:
-    """Tells what changes: a view on a terminal, else a line for each change."""
+    """Reports changes: in a view on a terminal, else a line for each change."""
 
     def __init__(self, shadow: Shadow, live: Live | None) -> None:
         motors = shadow.twin.robot.motor_names
         self.changes = Changes(motors)
         self._shadow, self._live = shadow, live
         self._view = View(motors, shadow.source.name)
-        self._begun_s, self._drawn_s, self._looked = time.monotonic(), 0.0, False
+        self._start_s, self._drawn_s, self._set_up_told = time.monotonic(), 0.0, False
 
     def look(self, last: bool = False) -> None:
-        """Tell what has changed since the last call."""
-        shadow, changes, monitor = self._shadow, self.changes, self._shadow.monitor
-        troubles = _troubles(shadow, time.monotonic() - self._begun_s)
-        if monitor is not None:
-            troubles += monitor.rounding
-            troubles += () if monitor.set_up else _misfit(monitor.fit)
-        counts = _with_stamps(shadow.source.counts, shadow.clock.senseless)
-        found = changes.notice(shadow.snapshot, counts, shadow.clock.jumps, troubles)
-        if monitor is not None and monitor.set_up is not None and not self._looked:
-            self._looked = True
-            found.append(changes.add(shadow.snapshot.stream_time, fit_of(monitor)))
+        """Report the changes since the last call."""
+        shadow, monitor = self._shadow, self._shadow.monitor
+        troubles = _troubles(shadow, time.monotonic() - self._start_s)
+        jumps = shadow.clock.jumps
+        for change in self.changes.notice(shadow.snapshot, shadow.counts, jumps, troubles):
+            self._tell(change)
+        if monitor is not None and monitor.set_up is not None and not self._set_up_told:
+            self._set_up_told = True
+            self.say(fit_of(monitor))
         if self._live is None:
-            for change in found:
-                tell(str(change))
             return
         self._view.remember(shadow.snapshot)
         if last or time.monotonic() >= self._drawn_s + REFRESH_S:
             self._drawn_s = time.monotonic()
-            picture = self._view.draw(shadow.snapshot, shadow.source.counts, changes.lines)
+            picture = self._view.draw(shadow.snapshot, shadow.counts, self.changes.lines)
             self._live.update(picture, refresh=True)
 
     def hear(self, event: Event | None) -> None:
@@ -80,8 +80,10 @@ class _Screen:
         self.look()
 
     def say(self, text: str) -> None:
-        """Tell something else."""
-        change = self.changes.add(self._shadow.snapshot.stream_time, text)
+        """Report something else."""
+        self._tell(self.changes.add(self._shadow.snapshot.stream_time, text))
+
+    def _tell(self, change: Change) -> None:
         if self._live is None:
             tell(str(change))
 
@@ -105,21 +107,31 @@ def watch_until_end(
     return screen.changes
 
 
-def _with_stamps(counts: LinkCounts, senseless: int) -> LinkCounts:
-    """Return what a link has seen, with stamps that make no sense among what makes none."""
-    if not senseless:
-        return counts
-    last = counts.last_garbage or "stamps that leap; such events count when they come"
-    return replace(counts, garbage=counts.garbage + senseless, last_garbage=last)
+def basis_line(known: CalibratedRobot, calibration: Path | None, budget: float, goals: bool) -> str:
+    """Return the calibration that the answers rest on, and the delay that lost commands cause.
 
-
-def _misfit(fit: Fit) -> tuple[str, ...]:
-    """Return that the calibration is not this robot's, if that is so."""
-    if not fit.given or fit.fits >= MISFIT:
-        return ()
+    Reported `goals` show lost commands at once.
+    """
+    healthy = known.imperfections
+    if healthy.name == GENERIC_NAME:
+        line = (
+            f"healthy behaviour: {healthy.name}; {healthy.source}. This robot is not calibrated: "
+            "its behaviour is learned as it works, and until then faults take longer to show. "
+            "--calibration FILE uses a calibration"
+        )
+    else:
+        written = ""
+        if calibration is not None and calibration.is_file():
+            day = date.fromtimestamp(calibration.stat().st_mtime).isoformat()
+            written = f", written {day}"
+        line = f"healthy behaviour: {healthy.name} ({healthy.protocol}; {healthy.source}{written})"
+    needed = {} if goals else movements_to_tell(healthy, known.robot.motor_names, budget)
+    if not needed:
+        return line
+    worst = max(needed, key=lambda motor: needed[motor])
     return (
-        f"this robot does not do what calibration {fit.given!r} says: it is judged by what arms of "
-        "its kind do and by what it teaches itself",
+        f"{line}. At these losses a {worst.replace('_', ' ')} that sticks at rest takes about "
+        f"{needed[worst]} movements to be told from lost commands"
     )
 
 
@@ -139,17 +151,27 @@ def fit_of(monitor: FaultMonitor) -> str:
 
 
 def _troubles(shadow: Shadow, since_s: float) -> tuple[str, ...]:
-    """Return what keeps the diagnosis from being made or told, after listening for so long [s]."""
+    """Return the obstacles to a diagnosis and its publication, `since_s` [s] after the start."""
     found = [sink.trouble for sink in shadow.sinks if sink.trouble]
     if shadow.source.counts.received == 0 and since_s > SILENCE_S:
         found.append(f"nothing comes from {shadow.source.name}")
     if shadow.reference.late_s >= LATE_S:
         wait = math.ceil(2.0 * shadow.reference.late_s) / 2.0
         found.append(f"commands come late: put commands_late_s = {wait} into the --topics file")
+    monitor = shadow.monitor
+    if monitor is None:
+        return tuple(found)
+    found += monitor.rounding
+    fit = monitor.fit
+    if fit.given and fit.fits < MISFIT and not monitor.set_up:
+        found.append(
+            f"this robot does not do what calibration {fit.given!r} says: it is judged by what "
+            "arms of its kind do and by what it teaches itself"
+        )
     return tuple(found)
 
 
-# The live view: motors, residual, posterior over time, and what changed.
+# The live view: motors, residual, posterior over time, changes.
 
 STYLES = {
     LEVEL_OK: "green",
@@ -159,9 +181,9 @@ STYLES = {
 }
 BLOCKS = " ▁▂▃▄▅▆▇█"
 COLUMNS = 60
-"""Width of the posterior over time."""
+"""Width of the posterior over time [columns]."""
 COLUMN_S = 1.0
-"""Time of the stream that one column stands for [s]."""
+"""Time of the stream for each column [s]."""
 RESIDUAL_MM = 50.0
 """Residual that fills its bar [mm]."""
 BAR = 20
@@ -170,7 +192,7 @@ SHOWN_CHANGES = 8
 
 
 class View:
-    """Draws what the shadow knows."""
+    """Live view of a shadow."""
 
     def __init__(self, motors: Sequence[str], source: str) -> None:
         self._motors = motors
@@ -194,7 +216,7 @@ class View:
     def draw(
         self, snapshot: Snapshot, counts: LinkCounts, changes: Sequence[Change]
     ) -> RenderableType:
-        """Return the view of what is known now; of the changes the newest is the last."""
+        """Return the view of a snapshot; the newest change is the last."""
         lines = [Text(printable(str(change))) for change in list(changes)[-SHOWN_CHANGES:]]
         return Group(
             self._head(snapshot, counts),

@@ -1,4 +1,4 @@
-"""The digital shadow: from the events of a link to answers, whatever happens to the link."""
+"""The digital shadow: from the events of a link to answers and messages."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.explanation import plain_name, with_reading_doubt
 
 SILENCE_S = 5.0
-"""Without a reading for so long on our own clock, the answer is stale [s]."""
+"""Time without a reading, on our own clock, after which the answer is stale [s]."""
 TOGETHER_S = 0.1
-"""Motor readings count with a reading of the tool that is no further away in time [s]."""
+"""Maximum time between a reading of the motors and the reading of the tool it belongs to [s]."""
 TICK_S = 0.5
-"""Time without an event after which the diagnoser is told that time goes on [s]."""
+"""Time without an event after which the diagnoser is updated without data [s]."""
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What the shadow knows at one time.
+    """State of the shadow at one time.
 
     Attributes:
-        answer: What is believed, by the robot's clock.
+        answer: The diagnosis, by the robot's clock.
         stream_time: Time since the first event, without leaps [s].
-        residual: Tool position minus where the reference puts it, (axis,) [m]; NaN if not known.
-        seconds: Time that the last sample took from our hands to its answer [s].
+        residual: Measured minus expected tool position, (axis,) [m]; NaN if not known.
+        seconds: Time from the last sample to its answer [s].
     """
 
     answer: Answer
@@ -56,7 +56,7 @@ class Snapshot:
 
 
 class Shadow:
-    """Feeds a diagnoser from a source and publishes what was seen and what is believed.
+    """Feeds a diagnoser from a source and publishes events and answers.
 
     Commands may arrive `commands_late_s` [s] later than their stamps.
 
@@ -65,7 +65,7 @@ class Shadow:
         sinks: The sinks.
         twin: The twin of the robot.
         monitor: The diagnoser if it is a `FaultMonitor`, else None.
-        snapshot: What is known now.
+        snapshot: The latest state.
         clock: The robot's clock.
         reference: The commanded angles over time.
     """
@@ -90,21 +90,26 @@ class Shadow:
         self._fed_s = time.monotonic()
         self._newest = 0.0
         self._computed = False
-        self._motors: tuple[float, FloatArray] | None = None
+        self._position: tuple[float, FloatArray | None] = (-np.inf, None)
         self.snapshot = Snapshot(
             Answer(self.clock.stamp(0.0), STALE, None), 0.0, np.full(3, np.nan), 0.0
         )
+
+    @property
+    def counts(self) -> LinkCounts:
+        """Counts of the link; leaping stamps are counted as garbage."""
+        counts, leaps = self.source.counts, self.clock.senseless
+        if not leaps:
+            return counts
+        last = counts.last_garbage or "stamps that leap; such events count when they come"
+        return replace(counts, garbage=counts.garbage + leaps, last_garbage=last)
 
     def step(self, timeout_s: float) -> bool:
         """Take one event, or see after a wait [s] that time goes on; return if more may come."""
         return self.hear(self.source.poll(min(timeout_s, TICK_S)))
 
     def hear(self, event: Event | None) -> bool:
-        """Take an event of the source that was polled elsewhere; return if more may come.
-
-        Args:
-            event: None: nothing came just now.
-        """
+        """Take an event that was polled elsewhere, None: none came; return if more may come."""
         if event is not None:
             self._take(event)
         elif self.source.ended:
@@ -144,7 +149,7 @@ class Shadow:
         self._fed_s = time.monotonic()
         if reading.position is not None and np.isfinite(reading.position).all():
             self.reference.start_at(reading.position)
-            self._motors = reading.time, reading.position
+            self._position = reading.time, reading.position
             self._computed = bool(np.allclose(reading.tool, self.twin.path(reading.position)))
         seen = reading.tool if np.isfinite(reading.tool).all() else None
         command = None
@@ -166,14 +171,12 @@ class Shadow:
     def _update(
         self, reading: Reading, command: FloatArray | None, seen: FloatArray | None
     ) -> Answer:
-        """Tell the diagnoser of a reading, with what the motors said about then."""
-        time = reading.time
+        """Update the diagnoser with a reading, and the motor readings of the same time."""
+        at, (read_at, position) = reading.time, self._position
         if self.monitor is None:
-            return self._diagnoser.update(time, command, seen)
-        said = self._motors
-        there = said is not None and abs(time - said[0]) <= TOGETHER_S
-        position = said[1] if said is not None and there else None
-        return self.monitor.update(time, command, seen, position, reading.goal)
+            return self._diagnoser.update(at, command, seen)
+        together = abs(at - read_at) <= TOGETHER_S
+        return self.monitor.update(at, command, seen, position if together else None, reading.goal)
 
     def _publish(self, answer: Answer, residual: FloatArray) -> None:
         silent = time.monotonic() - self._read_s > SILENCE_S
@@ -187,27 +190,25 @@ class Shadow:
             sink.put(stamped)
 
 
-# What changes, in words: faults found, repairs noticed, silence, trouble with the link.
+# Changes in words: faults, repairs, silence, trouble with the link.
 
 KEPT = 1000
-"""Changes that are remembered; the recording holds all of them."""
+"""Maximum number of changes that are kept; the recording holds all of them."""
 GARBAGE_AFTER_S, GARBAGE_EVERY_S = 10.0, 3600.0
 """Time between the first two reports of messages that make no sense, or of stamps that leap; it
 doubles with each, up to the second [s]."""
-
-
 FIGURE = re.compile(r"(?:over )?(?<!motor )[-+]?\b\d[\d.]*")
-"""How much and how surely, which changes while what is said does not."""
+"""Figures in a message; a message that differs only in them is no news."""
 
 
 class _NowAndThen:
-    """Says when to report again what goes on without end."""
+    """Times at which a trouble that goes on is reported again."""
 
     def __init__(self) -> None:
         self._due_s, self._wait_s = -np.inf, GARBAGE_AFTER_S
 
     def due(self, at: float) -> bool:
-        """Return whether to report at a time of the stream [s]; then it is taken to be done."""
+        """Return whether to report at a time of the stream [s]; if so, it counts as reported."""
         if at < self._due_s:
             return False
         self._due_s, self._wait_s = at + self._wait_s, min(2.0 * self._wait_s, GARBAGE_EVERY_S)
@@ -215,7 +216,7 @@ class _NowAndThen:
 
 
 def _over(episode: Episode | None) -> str:
-    """Return that a fault is over, and how long its alarm stood."""
+    """Return the end of a fault and the length of its alarm in words."""
     if episode is None or episode.duration_s is None:
         return "healthy again"
     cause = plain_name(Hypothesis.parse(episode.cause))
@@ -251,7 +252,7 @@ class Changes:
     def notice(
         self, snapshot: Snapshot, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]
     ) -> list[Change]:
-        """Return what has changed since the last call."""
+        """Return the changes since the last call."""
         texts = self._link(snapshot.stream_time, counts, jumps, troubles)
         texts += self._silence(snapshot)
         texts += self._diagnosis(snapshot)

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -25,8 +26,9 @@ PIPE_WIDTH = 160
 
 
 def tell(text: str, *, err: bool = False) -> None:
-    """Print a line to stdout, or to stderr."""
-    click.echo(printable(text), err=err)
+    """Print a line to stdout, or to stderr; nothing if there is nothing to say."""
+    if text:
+        click.echo(printable(text), err=err)
 
 
 @dataclass(frozen=True)
@@ -34,10 +36,10 @@ class Table:
     """Rows of text under headings.
 
     Attributes:
-        headings: One a column.
-        rows: Cells, as many as there are headings.
+        headings: Headings of the columns.
+        rows: Cells of each row, one for each heading.
         align: ``l`` (text) or ``r`` (figures) for each column; empty: all to the left.
-        title: What stands above; empty: nothing.
+        title: Title above the table; empty: none.
         header: Whether the headings are shown on a terminal.
     """
 
@@ -59,8 +61,12 @@ def figures_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title:
     return Table(headings, list(rows), "l" + "r" * (len(headings) - 1), title)
 
 
+Part = str | Table
+"""A sentence or a table of a report."""
+
+
 def console() -> Console:
-    """Return the console that everything is printed on; brackets and colons are as they are."""
+    """Return the console for all output; it takes brackets and colons literally."""
     from rich.console import Console
 
     plain = Console(highlight=False, markup=False, emoji=False)
@@ -69,7 +75,7 @@ def console() -> Console:
     return plain
 
 
-def show(*parts: str | Table) -> None:
+def show(*parts: Part) -> None:
     """Print sentences, which no width cuts, and tables; text of files only as text."""
     out = console()
     for part in parts:
@@ -90,6 +96,27 @@ def _on_terminal(table: Table) -> TerminalTable:
     for row in table.rows:
         drawn.add_row(*map(printable, row))
     return drawn
+
+
+def write_json(records: Iterable[Mapping[str, Any]], path: Path | None) -> None:
+    """Write JSON objects, one a line; None: nothing is written.
+
+    Raises:
+        OutputError: If they cannot be written.
+    """
+    from failuretwin.data_knowledge.store import write_records
+
+    if path is not None:
+        write_records(records, path)
+
+
+@contextmanager
+def until_interrupted() -> Iterator[None]:
+    """End the block on Ctrl-C, and report it."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        tell("stopped")
 
 
 # Progress of long work: a bar on a terminal, now and then a line elsewhere.

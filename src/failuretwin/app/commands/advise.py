@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from failuretwin.app.commands.options import PATH, calibration_option, common_options, json_option
-from failuretwin.app.terminal import show, tell
+from failuretwin.app.commands import options as opt
+from failuretwin.app.terminal import show, tell, write_json
+from failuretwin.core.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from failuretwin.decision.remaining_life import RemainingLife
@@ -19,34 +20,26 @@ Report = tuple[list[str], list[dict[str, Any]]]
 
 @click.command()
 @click.argument(
-    "source", metavar="[RESULTS.jsonl|HISTORY.history.jsonl]", type=PATH, required=False
+    "source", metavar="[RESULTS.jsonl|HISTORY.history.jsonl]", type=opt.PATH, required=False
 )
-@click.option(
-    "--costs", type=PATH, metavar="FILE.toml", help="Cost table: downtime, repair, replacement."
-)
-@click.option("--template", type=PATH, metavar="FILE.toml", help="Write a cost table to fill in.")
+@opt.file_option("--costs", "FILE.toml", "Cost table: downtime, repair, replacement.")
+@opt.file_option("--template", "FILE.toml", "Write a cost table to fill in.")
 @click.option("--run", metavar="NAME", help="Run to use. Default: the last one.")
-@json_option("Write the advice.")
-@calibration_option
-@common_options
+@opt.json_option("Write the advice.")
+@opt.calibrated_robot_options()
 def advise(
     source: Path | None,
     costs: Path | None,
     template: Path | None,
     run: str | None,
     json_file: Path | None,
-    calibration: Path | None,
-    robot: str,
-    seed: int,
+    robot: opt.RobotOptions,
 ) -> None:
-    """Say what costs least: continue, compensate, slow down, inspect, replace, stop.
+    """Report the cheapest action: continue, compensate, slow down, inspect, replace, stop.
 
-    RESULTS.jsonl is what `diagnose --json` wrote. Of a history that `diagnose --track` keeps, the
-    remaining life of every motor is told; name its calibration (--calibration).
+    RESULTS.jsonl is a file of `diagnose --json`. For a history that `diagnose --track` keeps, the
+    remaining life of every motor is reported; name its calibration (--calibration).
     """
-    from failuretwin.core.errors import InputError
-    from failuretwin.data_knowledge.store import write_records
-
     if template is not None:
         _write_template(template)
         tell(f"costs to be filled in: {template}")
@@ -55,7 +48,7 @@ def advise(
             raise InputError("nothing to advise on. Name results or a history, or --template FILE.")
         return
     if source.name.endswith(".history.jsonl"):
-        lines, records = _life_report(source, calibration, robot, seed)
+        lines, records = _life_report(source, robot)
     else:
         if costs is None:
             raise InputError(
@@ -64,13 +57,11 @@ def advise(
             )
         lines, records = _results_report(source, costs, run)
     show(*lines)
-    if json_file is not None:
-        write_records(records, json_file)
+    write_json(records, json_file)
 
 
 def _write_template(path: Path) -> None:
     """Write a cost table to fill in; an existing file is never overwritten."""
-    from failuretwin.core.errors import OutputError
     from failuretwin.data_knowledge.store import write_text
     from failuretwin.decision.expected_cost import TEMPLATE
 
@@ -85,7 +76,6 @@ def _results_report(source: Path, costs_file: Path, run: str | None) -> Report:
     Raises:
         InputError: If a file cannot be read, or there is no such run.
     """
-    from failuretwin.core.errors import InputError
     from failuretwin.decision.expected_cost import advise as advise_on
     from failuretwin.decision.expected_cost import load_costs
     from failuretwin.decision.results import read_results
@@ -108,7 +98,7 @@ def _results_report(source: Path, costs_file: Path, run: str | None) -> Report:
     return [*lines, advice.verdict], [record]
 
 
-def _life_report(source: Path, calibration: Path | None, robot: str, seed: int) -> Report:
+def _life_report(source: Path, robot: opt.RobotOptions) -> Report:
     """Return the remaining life of every motor of a tracked robot.
 
     Raises:
@@ -117,17 +107,15 @@ def _life_report(source: Path, calibration: Path | None, robot: str, seed: int) 
     import numpy as np
 
     from failuretwin.connection.life_history import read_rows
-    from failuretwin.core.errors import InputError
     from failuretwin.decision.remaining_life import LEAST_RUNS, motor_lives
-    from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.inference.observation.healthy_model import HealthyModel
 
-    known = load_calibration(calibration, robot)
+    known = robot.known
     rows = read_rows(source, known.robot.name)
     if not rows:
         raise InputError(f"{source}: holds no run. Expected what `diagnose --track` keeps.")
     model = HealthyModel(known.twin, known.imperfections)
-    lives = motor_lives(rows, model, np.random.default_rng(seed))
+    lives = motor_lives(rows, model, np.random.default_rng(robot.seed))
     lines = [
         f"{name}: fewer than {LEAST_RUNS} runs say something of its wear"
         if life is None

@@ -9,60 +9,37 @@ from typing import TYPE_CHECKING
 
 import click
 
-from failuretwin.app.commands.options import (
-    PATH,
-    LogOptions,
-    RenamedOption,
-    common_options,
-    gathered,
-    hypotheses_option,
-    plugin_option,
-    reading_options,
-)
-from failuretwin.app.terminal import progress_bar, tell
-from failuretwin.core.errors import counted
+import failuretwin as ft
+from failuretwin.app.commands import options as opt
+from failuretwin.app.terminal import progress_bar, show, tell
+from failuretwin.core.errors import InputError, counted
 
 if TYPE_CHECKING:
     from failuretwin.digital_model.urdf.report import UrdfReport
 
 
 @click.command("import")
-@click.argument("sources", nargs=-1, required=True, type=PATH, metavar="SRC...")
-@click.option(
+@opt.file_option(
     "--out",
+    "FILE",
+    "Output: a run set (.nc, .zarr), a published layout (.mat: one file of cells, no ending "
+    "for a folder of pairs), or .csv.",
     required=True,
-    type=PATH,
-    help="What to write: a run set (.nc, .zarr), a published layout (.mat: one file of cells, no "
-    "ending for a folder of pairs), or .csv.",
 )
-@reading_options
-@common_options
-def import_(
-    sources: tuple[Path, ...],
-    out: Path,
-    reading: LogOptions,
-    robot: str,
-    seed: int,
-) -> None:
+@opt.reading_options
+@opt.robot_options
+def import_(out: Path, reading: opt.LogOptions, robot: opt.RobotOptions) -> None:
     """Read logs and write them as one run set.
 
-    SRC is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
-    downwards), such a file (.mat), a bag (.bag, .mcap), a LeRobot data set (a folder), an RTDE
-    recording, or a CSV file, with --columns where its column names do not tell enough.
+    LOG is any input of `diagnose`.
     """
-    del seed  # nothing here is drawn by chance
-    from failuretwin.app.inputs import read_inputs
-    from failuretwin.core.errors import InputError
     from failuretwin.data_knowledge.readers.matlab import check_export_suffix, export_runs
-    from failuretwin.digital_model.robot import load_robot
-    from failuretwin.digital_model.twin import DigitalTwin
 
     check_export_suffix(out)
-    if out.resolve() in [source.resolve() for source in sources]:
+    if out.resolve() in [log.resolve() for log in reading.logs]:
         raise InputError(f"{out}: is what is to be read. Give another name to write to.")
-    model = load_robot(robot)
-    runs = read_inputs(sources, model, reading)
-    export_runs(runs, out, DigitalTwin(model))
+    runs = reading.runs(robot.model)
+    export_runs(runs, out, ft.DigitalTwin(robot.model))
     tell(f"{counted(runs.sizes['run'], 'run')} written to {out}")
 
 
@@ -70,51 +47,36 @@ def import_(
 
 
 @click.command()
-@click.option("--out", required=True, type=PATH, help="Run set to write (.nc or .zarr).")
-@click.option(
-    "--runs-per-class",
-    type=click.IntRange(min=1),
-    default=400,
-    help="Runs of each hypothesis; the paper has 400.",
-)
-@hypotheses_option(
+@opt.file_option("--out", "FILE", "Run set to write (.nc or .zarr).", required=True)
+@opt.count_option("--runs-per-class", 400, "Runs of each hypothesis; the paper has 400.", least=1)
+@opt.hypotheses_option(
     "Hypotheses to simulate, such as healthy,motor_2:stuck. Default: the paper's nine classes."
-)
-@click.option(
-    "--calibration",
-    "--imperfections",
-    cls=RenamedOption,
-    default="none",
-    metavar="none|NAME|FILE",
-    help="What the robot does that its twin does not: nothing, what is known of the robot of that "
-    "name, or a TOML file.",
 )
 @click.option(
     "--engine",
     type=click.Choice(["servo", "physics"]),
     default="servo",
-    help="What moves the robot: the published servo loops, or rigid-body physics (MuJoCo) with "
-    "gears that stick and joints that flex.",
+    help="servo: the published servo loops. physics: rigid bodies (MuJoCo) with friction in the "
+    "gears and flexible joints.",
 )
 @click.option(
     "--sensors",
     metavar="KIND,...",
-    help="Sensors to simulate beside that of the tool's position, as the profile has them: "
-    "accelerometer, gyroscope, orientation, wire.",
+    help="Sensors of the profile to simulate in addition to the tool's position: accelerometer, "
+    "gyroscope, orientation, wire.",
 )
-@click.option(
+@opt.file_option(
     "--faults",
-    type=PATH,
-    metavar="FILE",
-    help="How large faults are, when they begin and how they grow: a TOML file with a table for "
-    "each mode, such as [drift]. Default: the paper's stuck and steady_state_error; the other "
-    "modes as assumed in docs/fault_modes.md.",
+    "FILE",
+    "Size, onset and growth of faults: a TOML file with a table for each mode, such as "
+    "[drift]. Default: the paper's stuck and steady_state_error; the other modes as assumed in "
+    "docs/fault_modes.md.",
 )
-@click.option(
+@opt.count_option(
     "--workers",
-    type=click.IntRange(min=1),
-    default=1,
-    help="Processes on this machine to spread the work over; the runs do not depend on it.",
+    1,
+    "Processes on this machine to spread the work over; the runs do not depend on it.",
+    least=1,
 )
 @click.option(
     "--scheduler",
@@ -122,20 +84,18 @@ def import_(
     help="Dask scheduler whose workers do the work instead, such as tcp://host:8786. They must "
     "share the folder of --out.",
 )
-@plugin_option
-@common_options
+@opt.plugin_option
+@opt.calibrated_robot_options("none")
 def simulate(
     out: Path,
     runs_per_class: int,
     hypotheses: str | None,
-    calibration: str,
     engine: str,
     sensors: str | None,
     faults: Path | None,
     workers: int,
     scheduler: str | None,
-    robot: str,
-    seed: int,
+    robot: opt.RobotOptions,
 ) -> None:
     """Make labelled runs with the digital twin and write them as a run set.
 
@@ -143,24 +103,21 @@ def simulate(
     with what is missing. Up to a few thousand can be written to .nc.
     """
     from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
-    from failuretwin.data_knowledge.generate import Plan
     from failuretwin.data_knowledge.resumable import produce
     from failuretwin.data_knowledge.store import check_destination
     from failuretwin.data_knowledge.workers import Workforce
-    from failuretwin.digital_model.calibrated_robot import load_calibration
-    from failuretwin.digital_model.robot import load_robot
     from failuretwin.failure_behavior.registry import MODES, load_modes
 
     check_destination(out)
-    known = load_calibration(calibration, load_robot(robot))
+    known = robot.known
     names = known.robot.motor_names
-    plan = Plan(
+    plan = ft.Plan(
         robot=known.robot,
         hypotheses=paper_hypotheses(names)
         if hypotheses is None
         else parse_hypotheses(hypotheses.split(","), names),
         runs_per_class=runs_per_class,
-        seed=seed,
+        seed=robot.seed,
         imperfections=known.imperfections,
         engine=engine,
         sensors=[] if sensors is None else [kind.strip() for kind in sensors.split(",")],
@@ -185,16 +142,16 @@ class UrdfOptions:
     sensor_noise: float
 
     def report(self) -> UrdfReport:
-        """Return what the URDF holds and lacks."""
+        """Return the contents of the URDF and what is missing."""
         from failuretwin.digital_model.urdf.check import check_urdf
 
         return check_urdf(self.path, self.base, self.tool, 1e-3 * self.sensor_noise)
 
 
-urdf_options = gathered(
+urdf_options = opt.gathered(
     UrdfOptions,
     "urdf",
-    click.argument("path", type=PATH, metavar="URDF"),
+    click.argument("path", type=opt.PATH, metavar="URDF"),
     click.option(
         "--base",
         metavar="LINK",
@@ -205,7 +162,6 @@ urdf_options = gathered(
         "--sensor-noise",
         type=click.FloatRange(min=0.0),
         default=0.5,
-        show_default=True,
         metavar="MM",
         help="Noise of the tool sensor on each axis [mm]; joints that move the tool by less for "
         "each radian are left out.",
@@ -219,6 +175,9 @@ urdf_options = gathered(
 )
 
 
+profile_option = opt.file_option("--out", "PROFILE", "Profile to write: .toml.", required=True)
+
+
 @click.group()
 def robot() -> None:
     """Look a URDF over, make a robot profile of it, and fit it to healthy logs."""
@@ -227,16 +186,16 @@ def robot() -> None:
 @robot.command()
 @urdf_options
 def check(urdf: UrdfOptions) -> None:
-    """Say whether a URDF can be used, which motors move the tool, and what is missing."""
-    from failuretwin.app.reports.robot_report import print_urdf
+    """Report whether a URDF can be used, which motors move the tool, and what is missing."""
+    from failuretwin.app.reports.robot_report import urdf_parts
 
     report = urdf.report()
-    print_urdf(report)
+    show(*urdf_parts(report))
     report.raise_errors()
 
 
 @robot.command()
-@click.option("--out", required=True, type=PATH, metavar="PROFILE", help="Profile to write: .toml.")
+@profile_option
 @click.option(
     "--home",
     metavar="ANGLE,...",
@@ -265,8 +224,6 @@ def _check_profile(out: Path, replaced: Path | None = None) -> None:
     Raises:
         InputError: If it does not end in .toml, or another file has this name.
     """
-    from failuretwin.core.errors import InputError
-
     if out.suffix != ".toml":
         raise InputError(f"{out}: a profile ends in .toml. Give such a name.")
     if out.exists() and (replaced is None or out.resolve() != replaced.resolve()):
@@ -276,17 +233,14 @@ def _check_profile(out: Path, replaced: Path | None = None) -> None:
 def _write_profile(text: str, out: Path) -> None:
     """Write a profile that `load_robot` accepts; otherwise nothing is written."""
     from failuretwin.data_knowledge.store import replacing
-    from failuretwin.digital_model.robot import load_robot
 
     with replacing(out) as partial:
         partial.write_text(text, encoding="utf-8")
-        load_robot(partial)
+        ft.load_robot(partial)
 
 
 def _home(text: str | None, report: UrdfReport) -> list[float]:
-    """Return the angles at rest that the user gives [rad or m]; empty where none are given."""
-    from failuretwin.core.errors import InputError
-
+    """Return the angles at rest of `--home` [rad or m]; empty if it is not given."""
     if text is None:
         return []
     try:
@@ -304,31 +258,27 @@ def _home(text: str | None, report: UrdfReport) -> list[float]:
 
 
 @robot.command("fit")
-@click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG...")
-@click.option("--out", required=True, type=PATH, metavar="PROFILE", help="Profile to write: .toml.")
-@reading_options
-@common_options
-def fit_(logs: tuple[Path, ...], out: Path, reading: LogOptions, robot: str, seed: int) -> None:
+@profile_option
+@opt.reading_options
+@opt.robot_options
+def fit_(out: Path, reading: opt.LogOptions, robot: opt.RobotOptions) -> None:
     """Find frames, tool point, senses, zeros and geometry from poses in which a healthy arm rests.
 
-    LOG is whatever `diagnose` reads. Writes the profile of --robot with what was found, its remarks
-    kept. Forty poses all over the range tell the frames, hundreds the geometry.
+    LOG is any input of `diagnose`. The profile of --robot is written with the fitted values, its
+    remarks kept. Forty poses all over the range tell the frames, hundreds the geometry.
     """
-    del seed  # nothing here depends on chance
     from datetime import UTC, datetime
 
-    from failuretwin.app.inputs import read_inputs
-    from failuretwin.app.reports.robot_report import print_registration
+    from failuretwin.app.reports.robot_report import registration_parts
     from failuretwin.connection.registration.fit import fit_registration
     from failuretwin.digital_model.profile_text import fitted_text
-    from failuretwin.digital_model.robot import load_robot
 
-    model = load_robot(robot)
+    model = robot.model
     _check_profile(out, model.source)
-    runs = read_inputs(logs, model, reading)
-    names = ", ".join(log.name for log in logs)
+    runs = reading.runs(model)
+    names = ", ".join(log.name for log in reading.logs)
     found = fit_registration(runs, model, names, datetime.now(UTC).date().isoformat())
     text = fitted_text(model.source.read_text(encoding="utf-8"), model.source, out, found.profile)
     _write_profile(text, out)
-    print_registration(found)
+    show(*registration_parts(found))
     tell(f"written to {out}; use it with --robot {out}")

@@ -2,40 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-from failuretwin.app.commands.options import (
-    PATH,
-    LogOptions,
-    calibration_option,
-    common_options,
-    hypotheses_option,
-    json_option,
-    plugin_option,
-    reading_options,
-    refuse_unused,
-    report_option,
-)
-from failuretwin.app.terminal import progress_bar, show, tell
-
-if TYPE_CHECKING:
-    import xarray as xr
-
-    from failuretwin.connection.life_history import History
-    from failuretwin.connection.self_calibration import SelfCalibration
-    from failuretwin.connection.tracked_diagnosis import Tracked
-    from failuretwin.core.hypothesis import Diagnosis
-    from failuretwin.decision.robot_state import RobotState
-    from failuretwin.digital_model.twin import DigitalTwin
-    from failuretwin.inference.diagnoser import BayesDiagnoser
-    from failuretwin.inference.faults.priors import Priors
-    from failuretwin.inference.together.fault_course import FaultCourse
-
+import failuretwin as ft
+from failuretwin.app.commands import options as opt
+from failuretwin.app.terminal import show, tell
+from failuretwin.core.errors import InputError
 
 BAYES_ONLY = (
     *("calibration", "track", "self_calibrate", "hypotheses"),
@@ -46,73 +20,36 @@ LEARNING = ("out", "independent")
 """Options that only learning from several runs has."""
 
 
-@dataclass(frozen=True)
-class Findings:
-    """Diagnoses of runs, and what the runs taught together.
-
-    Attributes:
-        diagnoses: Diagnosis of each run.
-        bayes: The Bayesian diagnoser, with the calibration learned from the runs.
-        learned: Result of --self-calibrate; None: not asked for.
-        tracked: Result of --track; None: not asked for.
-    """
-
-    diagnoses: Sequence[Diagnosis]
-    bayes: BayesDiagnoser
-    learned: SelfCalibration | None = None
-    tracked: Tracked | None = None
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """Sentences on the robot learned by --self-calibrate."""
-        return () if self.learned is None else self.learned.remarks
-
-    @property
-    def lines(self) -> list[str]:
-        """Lines on everything learned."""
-        from failuretwin.app.reports.calibration_report import tracking_line
-
-        lines = [f"self-calibrated: {line}" for line in self.remarks]
-        return lines if self.tracked is None else [*lines, tracking_line(self.tracked)]
-
-
 @click.command()
-@click.argument("inputs", nargs=-1, required=True, type=PATH, metavar="INPUT...")
-@calibration_option
 @click.option(
     "--method",
     default="bayes",
     metavar="bayes|MODEL|bayes+MODEL|module:Class",
-    help="How to diagnose: by Bayes' rule, by a network that `train` wrote, by both, or by a class "
-    "of your own.",
+    help="Method of diagnosis: Bayes' rule, a network that `train` wrote, both, or your own class.",
 )
-@click.option(
+@opt.flag_option(
     "--track",
-    is_flag=True,
-    help="Judge each run by what those before it teach of the robot, and go on learning. Give runs "
-    "in their order, the oldest first. Without --calibration it begins with what such arms are "
-    "like. What is known is kept beside the calibration, or beside --out (FILE.history.jsonl).",
+    "Learn the robot run by run: judge each by those before it. Give runs "
+    "in their order, the oldest first. Without --calibration it begins with the arm class. The "
+    "history is kept beside the calibration, or beside --out (FILE.history.jsonl).",
 )
-@click.option(
+@opt.flag_option(
     "--self-calibrate",
-    is_flag=True,
-    help="Let the runs, all of one robot, say together how it differs from others of its kind: no "
-    "healthy logs are needed. With --calibration FILE, how it differs from that.",
+    "Learn from all runs together, all of one robot, how it differs from others of its kind "
+    "or from --calibration FILE. No healthy logs are needed.",
 )
-@click.option(
+@opt.flag_option(
     "--independent",
-    is_flag=True,
-    help="With --track or --self-calibrate: what was wrong in one run says nothing of the next, as "
-    "in a set of experiments. Default: faults stay until repaired, and the runs, in their order, "
-    "get one verdict beside their own.",
+    "With --track or --self-calibrate: faults of one run say nothing of the next, as in a set "
+    "of experiments. Default: faults stay until repaired, and the runs, in their order, get one "
+    "verdict in addition to their own.",
 )
-@click.option(
+@opt.file_option(
     "--out",
-    type=PATH,
-    metavar="FILE",
-    help="Where to write the calibration that --self-calibrate learns, or --track that began cold.",
+    "FILE",
+    "Calibration to write: learned by --self-calibrate, or by --track without --calibration.",
 )
-@hypotheses_option(
+@opt.hypotheses_option(
     "Hypotheses to consider, at least two: healthy, MOTOR:MODE, two of these joined by '+', or "
     "unknown. Example: healthy,motor_2:stuck. Default: the paper's nine classes."
 )
@@ -134,20 +71,18 @@ class Findings:
 @click.option(
     "--sensing",
     metavar="SENSOR+...",
-    help="What to believe: tool (its position), orientation, accelerometer, gyroscope, wire, "
+    help="Sensors to use: tool (its position), orientation, accelerometer, gyroscope, wire, "
     "encoders, or several joined by '+'. Default: tool where runs have it, else what they have.",
 )
-@json_option("Write one object a run, one a line.")
-@click.option("--csv", "csv_file", type=PATH, help="Write a table, a row a run.")
-@report_option(
-    "Write index.html: the state of the robot, what to do, and pictures of some runs.", "--plot"
+@opt.json_option("Write one object a run, one a line.")
+@opt.file_option("--csv csv_file", "FILE", "Write a table, a row a run.")
+@opt.report_option(
+    "Write index.html: the state of the robot, what to do, and pictures of some runs."
 )
-@reading_options
-@plugin_option
-@common_options
+@opt.reading_options
+@opt.plugin_option
+@opt.calibrated_robot_options()
 def diagnose(
-    inputs: tuple[Path, ...],
-    calibration: Path | None,
     method: str,
     track: bool,
     self_calibrate: bool,
@@ -161,254 +96,90 @@ def diagnose(
     json_file: Path | None,
     csv_file: Path | None,
     report: Path | None,
-    reading: LogOptions,
-    robot: str,
-    seed: int,
+    reading: opt.LogOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Diagnose runs from commands and tool path alone, or what other sensors saw (--sensing).
 
-    INPUT is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
+    LOG is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
     downwards), such a file (.mat), a bag (.bag, .mcap), a LeRobot data set (a folder), an RTDE
     recording, or a CSV file, with --columns where its column names do not tell enough.
     """
-    del seed  # the diagnosis draws nothing at random
     from failuretwin.app import inputs as given
+    from failuretwin.app import learning
     from failuretwin.app.reports import reports
     from failuretwin.app.reports.isolability_report import isolability_summary
-    from failuretwin.decision.evaluation import Judged
+    from failuretwin.app.reports.technician_page import write_report
+    from failuretwin.decision.results import write_csv, write_json_lines
     from failuretwin.decision.robot_state import course_of, robot_state
-    from failuretwin.digital_model.calibrated_robot import load_calibration
-    from failuretwin.inference.diagnoser import BayesDiagnoser
     from failuretwin.inference.faults.priors import priors_of
     from failuretwin.inference.observation.sensors import TOOL_ALONE, sensing_of
 
-    known = load_calibration(calibration, robot)
-    bayes = BayesDiagnoser(
+    known, calibration = robot.known, robot.calibration
+    bayes = ft.BayesDiagnoser(
         known.twin,
         imperfections=known.imperfections,
         hypotheses=given.parse_cli_hypotheses(hypotheses, known.robot),
         priors=priors_of(known.robot, sse_range, onset, error_range),
         sensing=sensing,
     )
-    if method != given.BAYES:
-        refuse_unused("only the Bayesian diagnosis has these options", *BAYES_ONLY)
+    _refuse_unused(method == given.BAYES, track, self_calibrate)
     diagnoser = given.chosen_diagnoser(method, bayes)
     together = track or self_calibrate
-    _check_together(calibration, track and self_calibrate, track, out)
-    if not together:
-        refuse_unused("nothing is learned without --track or --self-calibrate", *LEARNING)
-    history = _history(bayes, calibration, out) if track else None
-    runs = given.read_inputs(inputs, known.robot, reading)
+    history = learning.opened_history(bayes, calibration, out) if track else None
+    runs = reading.runs(known.robot)
     sensed = sensing_of(runs, sensing)
     given.warn_mismatch(runs, given.expected_name(diagnoser))
     if together:
-        _check_tool(sensed)
-        found = (
-            _self_calibrate(runs, bayes, calibration, out)
-            if history is None
-            else _track(runs, bayes, history)
-        )
+        learning.check_learning_from(sensed)
+    if history is not None:
+        found = learning.tracked(runs, bayes, history, out)
+    elif self_calibrate:
+        found = learning.self_calibrated(runs, bayes, calibration, out)
     else:
-        found = Findings(diagnoser.diagnose(runs), bayes)
+        found = learning.Findings(diagnoser.diagnose(runs), bayes)
     diagnoses = given.with_doubts(found.diagnoses, runs, known.twin)
     if (sse_range or error_range) and diagnoser is bayes:
         usual = priors_of(known.robot, None, onset)
-        _tell_ruled_out(runs, found.bayes, diagnoses, usual)
+        tell(learning.ruled_out_note(runs, found.bayes, diagnoses, usual), err=True)
     course = course_of(diagnoses, found.bayes) if together and not independent else None
     state = robot_state(diagnoses, known.robot, course, found.remarks if together else None)
-    _write_files(diagnoses, course, json_file, csv_file)
-    if report is not None:
-        _write_page(runs, diagnoses, known.twin, state, found.learned, report)
-    _keep(found.tracked, runs, out)
-    reports.print_diagnoses(diagnoses)
-    if method == given.BAYES and sensed == TOOL_ALONE:
-        show(*isolability_summary(runs, found.bayes))
-    show(*reports.state_lines(state, together=course is not None))
-    reports.print_scores(Judged.of(diagnoses))
-    last = [*reports.course_lines(course, state, known.robot), *found.lines]
-    show(*([""] if last else []), *last)
-
-
-def _track(runs: xr.Dataset, bayes: BayesDiagnoser, history: History) -> Findings:
-    """Return diagnoses that learn the robot run by run; `history` holds its earlier runs."""
-    from failuretwin.connection.tracked_diagnosis import diagnose_tracked
-
-    with progress_bar("diagnosing", runs.sizes["run"]) as advance:
-        tracked = diagnose_tracked(runs, bayes, history, advance)
-    return Findings(tracked.diagnoses, bayes, tracked=tracked)
-
-
-def _self_calibrate(
-    runs: xr.Dataset, bayes: BayesDiagnoser, calibration: Path | None, out: Path | None
-) -> Findings:
-    """Return diagnoses that learn the robot from all runs at once.
-
-    Args:
-        runs: The runs.
-        bayes: The diagnoser of single runs.
-        calibration: Calibration to start from; None: that of the kind of arm.
-        out: File for the learned calibration; None: not written.
-    """
-    from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
-    from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
-    from failuretwin.inference.together.folder_posterior import PASSES
-
-    robot = bayes.twin.robot
-    if out is not None:
-        check_calibration_file(out)
-    together = SelfCalibratingDiagnoser(robot, calibration, bayes.hypotheses, bayes.priors)
-    with progress_bar("self-calibrating", PASSES) as advance:
-        learned = together.learn(runs, advance)
-    if out is not None:
-        save_calibration(learned.calibration, robot, out)
-    known = learned.calibration.imperfections
-    calibrated = type(bayes)(together.twin, known, bayes.hypotheses, bayes.priors)
-    return Findings(learned.diagnoses, calibrated, learned=learned)
-
-
-def _check_tool(sensing: tuple[str, ...]) -> None:
-    """Refuse to weigh runs together that do not show the tool's position."""
-    from failuretwin.core.errors import InputError
-    from failuretwin.inference.observation.sensors import TOOL_ALONE
-
-    if sensing != TOOL_ALONE:
-        raise InputError(
-            f"the runs hold no tool position, but only what {' and '.join(sensing)} read. --track "
-            "and --self-calibrate learn from the tool's position: leave them out, or give logs "
-            "with one."
-        )
-
-
-def _tell_ruled_out(
-    runs: xr.Dataset, bayes: BayesDiagnoser, diagnoses: Sequence[Diagnosis], usual: Priors
-) -> None:
-    """Tell where runs show errors of a size that the user has ruled out.
-
-    Args:
-        runs: The runs.
-        bayes: What diagnosed them, with a range of errors.
-        diagnoses: Of each run.
-        usual: Beliefs without that range.
-    """
-    from dataclasses import replace
-
-    from failuretwin.core.errors import counted
-    from failuretwin.inference.explanation import joint_names_in
-
-    free = replace(bayes, priors=usual).diagnose(runs)
-    others = [
-        d
-        for d, told in zip(free, diagnoses, strict=True)
-        if str(d.diagnosis).endswith(":steady_state_error")
-        and d.diagnosis != told.diagnosis
-        and max(d.posterior.values()) > SURE
-    ]
-    if others:
-        said = joint_names_in(others[0].verdict, bayes.twin.robot)
-        tell(
-            f"note: {counted(len(others), 'run')} would look otherwise without the range of errors "
-            f"that was given, such as {others[0].run}: {said}",
-            err=True,
-        )
-
-
-SURE = 0.9
-"""Probability from which a run that looks otherwise is told."""
-
-
-def _check_together(calibration: Path | None, both: bool, track: bool, out: Path | None) -> None:
-    """Refuse ways of learning from runs that contradict each other.
-
-    Raises:
-        InputError: If they do.
-    """
-    from failuretwin.core.errors import InputError
-
-    if both:
-        raise InputError(
-            "--track judges each run by those before it, --self-calibrate by all. Choose one."
-        )
-    if out is not None and track and _is_file(calibration):
-        raise InputError(
-            "--track keeps what it learns beside the calibration that it began with. Leave out "
-            "--out, or --calibration to begin with what the kind of arm is like."
-        )
-
-
-def _is_file(calibration: Path | None) -> bool:
-    """Return whether a calibration is a file, beside which a history may be kept."""
-    from failuretwin.digital_model.calibrated_robot import GENERIC
-
-    return calibration is not None and calibration != Path(GENERIC)
-
-
-def _history(bayes: BayesDiagnoser, calibration: Path | None, out: Path | None) -> History:
-    """Return what has been seen of a robot before; nothing is kept where no file is named."""
-    from failuretwin.connection.calibration.result import check_calibration_file
-    from failuretwin.connection.life_history import History, open_history
-    from failuretwin.connection.tracked_diagnosis import begin
-
-    cold = not _is_file(calibration)
-    start, beside = begin(bayes, cold), out if cold else calibration
-    if out is not None:
-        check_calibration_file(out)
-    return History(start, cold) if beside is None else open_history(beside, start, cold)
-
-
-def _keep(tracked: Tracked | None, runs: xr.Dataset, out: Path | None) -> None:
-    """Keep what was learned of the runs; nothing was where they were not tracked."""
-    from failuretwin.connection.calibration.result import save_calibration
-    from failuretwin.connection.life_history import keep_history
-    from failuretwin.connection.tracked_diagnosis import calibration_of
-
-    if tracked is None:
-        return
-    if out is not None:
-        save_calibration(calibration_of(tracked.life, runs), tracked.life.model.twin.robot, out)
-    keep_history(tracked.history, tracked.life, tracked.rows)
-
-
-def _write_files(
-    diagnoses: Sequence[Diagnosis],
-    course: FaultCourse | None,
-    json_file: Path | None,
-    csv_file: Path | None,
-) -> None:
-    """Write results to the files that were asked for."""
-    from failuretwin.decision.results import write_csv, write_json_lines
-
     if json_file is not None:
         write_json_lines(diagnoses, json_file, course)
     if csv_file is not None:
         write_csv(diagnoses, csv_file, course)
+    if report is not None:
+        write_report(runs, diagnoses, known.twin, state, report, found.sections)
+        tell(f"the page: {report / 'index.html'}", err=True)
+    found.keep()
+    show(*reports.diagnosis_parts(diagnoses))
+    if method == given.BAYES and sensed == TOOL_ALONE:
+        show(*isolability_summary(runs, found.bayes))
+    show(*reports.state_lines(state, together=course is not None))
+    show(*reports.score_parts(diagnoses))
+    last = [*reports.course_lines(course, state, known.robot), *found.lines]
+    show(*([""] if last else []), *last)
 
 
-def _write_page(
-    runs: xr.Dataset,
-    diagnoses: Sequence[Diagnosis],
-    twin: DigitalTwin,
-    state: RobotState,
-    learned: SelfCalibration | None,
-    folder: Path,
-) -> None:
-    """Write the technician's page, with what was learned where runs were weighed together."""
-    from failuretwin.app.reports.calibration_report import taught_section
-    from failuretwin.app.reports.technician_page import write_report
-
-    sections = [] if learned is None else [taught_section(learned, twin.robot)]
-    write_report(runs, diagnoses, twin, state, folder, sections)
-    tell(f"the page: {folder / 'index.html'}", err=True)
+def _refuse_unused(bayes: bool, track: bool, self_calibrate: bool) -> None:
+    """Raise InputError if options contradict each other or have no effect."""
+    if track and self_calibrate:
+        raise InputError(
+            "--track judges each run by those before it, --self-calibrate by all. Choose one."
+        )
+    if not bayes:
+        opt.refuse_unused("only the Bayesian diagnosis has these options", *BAYES_ONLY)
+    if not (track or self_calibrate):
+        opt.refuse_unused("nothing is learned without --track or --self-calibrate", *LEARNING)
 
 
 @click.command()
-@report_option("Also write a page with pictures there (needs the extra `plots`).")
+@opt.report_option("Also write a page with pictures there (needs the extra `plots`).")
 def demo(report: Path | None) -> None:
     """Diagnose three simulated runs that come with the package, as `diagnose LOG` would.
 
     One is healthy, one has a stuck motor, one a motor that misses its targets.
     """
-    from failuretwin.data_knowledge.readers.read import sample_log
-
-    words = [str(sample_log()), *([] if report is None else ["--report", str(report)])]
+    words = [str(ft.sample_log()), *([] if report is None else ["--report", str(report)])]
     tell(f"failuretwin diagnose {' '.join(words)}\n")
     diagnose.main(words, prog_name="failuretwin diagnose", standalone_mode=False)

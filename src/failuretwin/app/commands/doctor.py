@@ -8,14 +8,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from failuretwin.app.commands.options import (
-    PATH,
-    LogOptions,
-    calibration_option,
-    common_options,
-    reading_options,
-)
+import failuretwin as ft
+from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import show, tell
+from failuretwin.core.errors import InputError, counted
 
 if TYPE_CHECKING:
     from failuretwin.inference.seen_runs import SeenRuns
@@ -23,49 +19,35 @@ if TYPE_CHECKING:
     from failuretwin.inference.set_ups.set_ups import SetUp
 
 SHOWN = 5
-"""So many kinds of remarks on logs are listed."""
+"""Maximum number of different remarks that are listed."""
 NAMED = 3
-"""So many runs are named beside a remark."""
+"""Maximum number of runs that are named after a remark."""
 
 
 @click.command()
-@click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG...")
-@calibration_option
-@click.option(
+@opt.file_option(
     "--out",
-    type=PATH,
-    metavar="MAP.toml",
-    help="Where to write what puts a wrong set-up right, beside what --columns says. Give it to "
-    "any command as --columns MAP.toml once you believe it.",
+    "MAP.toml",
+    "Column map to write, with the correction of a wrong set-up. If you agree with it, use it "
+    "with --columns MAP.toml.",
 )
-@reading_options
-@common_options
+@opt.reading_options
+@opt.calibrated_robot_options()
 def doctor(
-    logs: tuple[Path, ...],
-    calibration: Path | None,
     out: Path | None,
-    reading: LogOptions,
-    robot: str,
-    seed: int,
+    reading: opt.LogOptions,
+    robot: opt.RobotOptions,
 ) -> None:
-    """Say whether logs fit the profile: senses, order, units, axes, zeros, frames, clocks, grids.
+    """Test whether logs fit the profile: senses, order, units, axes, zeros, frames, clocks, grids.
 
-    LOG is whatever `diagnose` reads, faulty or not; all are taken to share one set-up. Every
-    mistake is weighed with every fault behind it, so that a broken motor is not taken for one.
+    LOG is any input of `diagnose`, faulty or not; all logs must share one set-up. Every mistake is
+    weighed together with every fault, so that a broken motor is not taken for a wrong set-up.
     """
-    del seed  # nothing here is drawn by chance
-    from failuretwin.app.inputs import read_inputs
-    from failuretwin.core.errors import InputError
-    from failuretwin.digital_model.calibrated_robot import load_calibration
-    from failuretwin.digital_model.robot import load_robot
-    from failuretwin.inference.diagnoser import BayesDiagnoser
-
     if out is not None and (out.suffix != ".toml" or out.exists()):
         raise InputError(f"{out}: expected a name that ends in .toml and is not taken yet.")
-    model = load_robot(robot)
-    known = load_calibration(calibration, model)
-    runs = read_inputs(logs, model, reading)
-    seen = BayesDiagnoser(known.twin, known.imperfections).seen(runs)
+    known = robot.known
+    runs = reading.runs(robot.model)
+    seen = ft.BayesDiagnoser(known.twin, known.imperfections).seen(runs)
     set_ups = seen.set_ups()
     unfit = _unfit(seen, set_ups)
     undo = set_ups.best.set_up if set_ups.fits else None
@@ -78,9 +60,9 @@ def doctor(
 
 
 def _unfit(seen: SeenRuns, set_ups: SetUpPosterior) -> str:
-    """Return what else keeps the log from fitting; empty if nothing does.
+    """Return any other reason why the log does not fit; empty if there is none.
 
-    No run of it allows a verdict, or the sensor stands a little elsewhere.
+    Either no run allows a verdict, or the sensor is slightly displaced.
     """
     fatal = [quality.fatal for quality in seen.evidence.quality]
     if all(fatal):
@@ -96,11 +78,10 @@ def _set_up_line(set_ups: SetUpPosterior, unfit: str) -> str:
 
 
 def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior, unfit: bool) -> list[str]:
-    """Return what the logs hold, and what is wrong with them.
+    """Return the contents of the logs and the remarks on them.
 
-    Of a log that does not fit it is not asked whether the calibration is of another robot.
+    The calibration is only compared with logs that fit the profile.
     """
-    from failuretwin.core.errors import counted
     from failuretwin.core.runs import measured_rate
     from failuretwin.inference.calibration_fit import calibration_told, fits_this_robot
 
@@ -127,7 +108,7 @@ def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior, unfit: bool) -> list[str
 
 
 def _in_runs(named: Sequence[str], count: int) -> str:
-    """Return in which of `count` runs something was found, as it stands behind a remark."""
+    """Return the runs of a remark in brackets; `count` is the number of all runs."""
     if count == 1:
         return ""
     if len(named) == count:
@@ -137,7 +118,7 @@ def _in_runs(named: Sequence[str], count: int) -> str:
 
 
 def _write(undo: SetUp | None, columns: Path | None, out: Path) -> None:
-    """Write what undoes a wrong set-up, beside the column map that the log was read with."""
+    """Write the correction of a wrong set-up, after the column map that the log was read with."""
     from failuretwin.data_knowledge.store import write_text
 
     if undo is None or not undo.what:

@@ -6,35 +6,26 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import (
-    PATH,
-    common_options,
-    plugin_option,
-    published_labels_option,
-    report_option,
-)
+import failuretwin as ft
+from failuretwin.app.commands import options as opt
+from failuretwin.app.terminal import show
+from failuretwin.core.errors import InputError
 
 
 @click.command()
-@click.argument("results", type=PATH, metavar="RESULTS.jsonl")
-@click.option(
+@click.argument("results", type=opt.PATH, metavar="RESULTS.jsonl")
+@opt.file_option(
     "--truth",
-    type=PATH,
-    metavar="RUNS",
-    help="Run set or raw sessions that know the truth; default: the results. Needed for the "
-    "coverage of intervals.",
+    "RUNS",
+    "Run set or raw sessions with the truth, needed for the coverage of intervals. Default: "
+    "the truth in the results.",
 )
-@published_labels_option
-@click.option(
-    "--against",
-    type=PATH,
-    metavar="OTHER.jsonl",
-    help="Compare with other results of the same runs.",
-)
-@click.option("--latex", type=PATH, metavar="FILE", help="Write the scores as LaTeX tables.")
-@report_option("Write a picture of the reliability.")
-@plugin_option
-@common_options
+@opt.published_labels_option
+@opt.file_option("--against", "OTHER.jsonl", "Compare with other results of the same runs.")
+@opt.file_option("--latex", "FILE", "Write the scores as LaTeX tables.")
+@opt.report_option("Write a picture of the reliability.")
+@opt.plugin_option
+@opt.robot_options
 def evaluate(
     results: Path,
     truth: Path | None,
@@ -42,39 +33,31 @@ def evaluate(
     against: Path | None,
     latex: Path | None,
     report: Path | None,
-    robot: str,
-    seed: int,
+    robot: opt.RobotOptions,
 ) -> None:
     """Score the results of `diagnose --json` against the truth."""
     import numpy as np
 
     from failuretwin.app.reports.plots import write_reliability
-    from failuretwin.app.reports.reports import (
-        print_comparison,
-        print_evaluation,
-        write_latex,
-    )
-    from failuretwin.core.errors import InputError
-    from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
-    from failuretwin.decision import evaluation
-    from failuretwin.decision.results import read_results
+    from failuretwin.app.reports.reports import comparison_parts, evaluation_parts, write_latex
+    from failuretwin.decision.evaluation import Truths
 
     truths = None
     if truth is not None:
-        runs = read_runs(truth, robot, ReadOptions(published_labels=published_labels))
-        truths = evaluation.Truths.of(runs, str(truth))
+        runs = ft.read_runs(truth, robot.robot, ft.ReadOptions(published_labels=published_labels))
+        truths = Truths.of(runs, str(truth))
     elif published_labels:
         raise InputError("--published-labels says how to read the truth. Add --truth RUNS.")
-    first = read_results(results)
-    scores = evaluation.evaluate(first, truths, np.random.default_rng(seed))
+    first = ft.read_results(results)
+    scores = ft.evaluate(first, truths, np.random.default_rng(robot.seed))
     comparison = None
     if against is not None:
-        second = read_results(against)
-        comparison = evaluation.compare(first, second, truths, np.random.default_rng(seed))
+        second, rng = ft.read_results(against), np.random.default_rng(robot.seed)
+        comparison = ft.compare(first, second, truths, rng)
     if latex is not None:
         write_latex(scores, comparison, latex)
     if report is not None:
         write_reliability(scores, report)
-    print_evaluation(scores, truth is not None)
+    show(*evaluation_parts(scores, truth is not None))
     if comparison is not None:
-        print_comparison(comparison)
+        show(*comparison_parts(comparison))

@@ -1,117 +1,98 @@
-"""`failuretwin calibrate`, `train` and `study`: what is learned, from logs or from the twin."""
+"""`failuretwin calibrate`, `train` and `study`: learning from logs or from the twin."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from failuretwin.app.commands.options import (
-    PATH,
-    LogOptions,
-    calibration_option,
-    common_options,
-    hypotheses_option,
-    plugin_option,
-    published_labels_option,
-    reading_options,
-    report_option,
-)
-from failuretwin.app.terminal import progress_bar, tell
+import failuretwin as ft
+from failuretwin.app.commands import options as opt
+from failuretwin.app.terminal import progress_bar, show, tell
+from failuretwin.core.errors import InputError
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from failuretwin.digital_model.robot import Robot
-
 
 @click.command()
-@click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG...")
-@click.option("--out", required=True, type=PATH, help="Calibration to write (.toml).")
+@opt.file_option("--out", "FILE", "Calibration to write (.toml).", required=True)
 @click.option(
     "--hold-out",
     metavar="SESSION",
-    help="Learn nothing from sessions with this in their name; only see how well they are "
-    "predicted. Default: each session is left out once, and the result learns from all.",
+    help="Sessions with this text in their name are only predicted, not learned from. Default: "
+    "each session is left out once, and the result learns from all.",
 )
-@click.option("--name", help="What results call the calibration. Default: the file's name.")
-@report_option("Write a page with tables and pictures.")
-@click.option(
+@click.option("--name", help="Name of the calibration in results. Default: the file's name.")
+@opt.report_option("Write a page with tables and pictures.")
+@opt.flag_option(
     "--pool",
-    is_flag=True,
-    help="Each LOG is a calibration of another robot of the kind: write what they have in common "
-    "and differ by, the prior of a robot that nobody has calibrated.",
+    "Each LOG is a calibration of another robot of the kind: write their mean and spread, the "
+    "prior of an uncalibrated robot.",
 )
-@reading_options
-@common_options
+@opt.reading_options
+@opt.robot_options
 def calibrate(
-    logs: tuple[Path, ...],
     out: Path,
     hold_out: str | None,
     name: str | None,
     report: Path | None,
     pool: bool,
-    reading: LogOptions,
-    robot: str,
-    seed: int,
+    reading: opt.LogOptions,
+    robot: opt.RobotOptions,
 ) -> None:
     """Learn from healthy logs where the motors settle, how they lag and what goes wrong by chance.
 
-    LOG is whatever `diagnose` reads. Motor readings are used where the logs have them, else the
-    tool path alone. Runs that are labelled or look faulty are left out. Step tests (CSV files, or
+    LOG is any input of `diagnose`. Motor readings are used where the logs have them, else the tool
+    path alone. Runs that are labelled or look faulty are left out. Step tests (CSV files, or
     folders that hold some) add servo loops and speed limits.
     """
-    del seed  # nothing here depends on chance
-    from failuretwin.app.inputs import read_inputs
-    from failuretwin.app.reports.calibration_report import print_calibration
+    from failuretwin.app.reports.calibration_report import (
+        calibration_parts,
+        write_calibration_page,
+    )
     from failuretwin.connection.calibration import step_parameters
-    from failuretwin.connection.calibration.calibrate import calibrate as learn
-    from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
-    from failuretwin.core.errors import InputError
-    from failuretwin.digital_model.robot import load_robot
+    from failuretwin.connection.calibration.result import check_calibration_file
 
     check_calibration_file(out)
     if pool:
         if hold_out is not None or report is not None:
             raise click.UsageError("--pool reads no logs. Leave out --hold-out and --report.")
-        _pool(logs, out, name, robot)
+        _pool(reading.logs, out, name, robot)
         return
-    tests, others = step_parameters.split_step_tests(logs, reading.columns)
-    steps = step_parameters.learn_loops(tests, load_robot(robot))
+    tests, others = step_parameters.split_step_tests(reading.logs, reading.columns)
+    steps = step_parameters.learn_loops(tests, robot.model)
     model = steps.robot
-    runs = read_inputs(others, model, reading)
-    source = ", ".join(str(log) for log in logs)
+    runs = replace(reading, logs=tuple(others)).runs(model)
+    source = ", ".join(map(str, reading.logs))
     wrong = _wrong_set_up(runs, model)
     try:
-        found = learn(runs, model, name or out.stem, source, hold_out)
+        found = ft.calibrate(runs, model, name or out.stem, source, hold_out)
     except InputError as error:
         if not wrong:
             raise
         raise InputError(f"{wrong} {error}") from error
     found = step_parameters.with_step_tests(found, steps)
-    if wrong:
-        tell(f"warning: {wrong}", err=True)
+    tell(wrong and f"warning: {wrong}", err=True)
     if report is not None:
-        from failuretwin.app.reports.calibration_report import write_calibration_page
-
         write_calibration_page(found, runs, model, report)
-    save_calibration(found, model, out)
-    print_calibration(found, model)
+    ft.save_calibration(found, model, out)
+    show(*calibration_parts(found, model))
     tell(f"written to {out}")
     if found.beats_uncalibrated is not False:
         tell(f"use it with `failuretwin diagnose --calibration {out}`")
 
 
-def _wrong_set_up(runs: xr.Dataset, robot: Robot) -> str:
-    """Return where logs do not fit the profile, which a calibration would learn as the robot.
+def _wrong_set_up(runs: xr.Dataset, robot: ft.Robot) -> str:
+    """Return the misfit between logs and profile, which a calibration would learn as the robot.
 
-    Small zeros are left to it: that is what a calibration is for.
+    Small zeros are no misfit: a calibration learns them.
     """
-    from failuretwin.inference.diagnoser import BayesDiagnoser
     from failuretwin.inference.seen_runs import set_up_remark
 
-    seen = BayesDiagnoser(robot).seen(runs)
+    seen = ft.BayesDiagnoser(robot).seen(runs)
     set_ups = seen.set_ups()
     remark = "" if set_ups.best.set_up.kind == "zero" else set_up_remark(set_ups)
     if set_ups.fits and not remark:
@@ -123,21 +104,17 @@ def _wrong_set_up(runs: xr.Dataset, robot: Robot) -> str:
     return f"{said}; what is learned of such logs is not the robot.{right}"
 
 
-def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: str) -> None:
+def _pool(
+    calibrations: tuple[Path, ...], out: Path, name: str | None, robot: opt.RobotOptions
+) -> None:
     """Write the population that some calibrated robots come from."""
-    from dataclasses import replace
+    from failuretwin.app.reports.calibration_report import population_parts
 
-    from failuretwin.app.reports.calibration_report import print_population
-    from failuretwin.connection.calibration.result import save_calibration
-    from failuretwin.connection.population import Population
-    from failuretwin.digital_model.robot import load_robot
-
-    model = load_robot(robot)
-    population = Population.fit(calibrations, model)
+    population = ft.Population.fit(calibrations, robot.model)
     figures = population.imperfections
-    found = replace(population, imperfections=replace(figures, name=name or figures.name))
-    save_calibration(found.calibration, model, out)
-    print_population(found.calibration, model)
+    population = replace(population, imperfections=replace(figures, name=name or figures.name))
+    ft.save_calibration(population.calibration, robot.model, out)
+    show(*population_parts(population.calibration, robot.model))
     tell(f"written to {out}")
     tell(
         "use it for another robot of the kind with `failuretwin diagnose LOGS --self-calibrate "
@@ -146,56 +123,44 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: st
 
 
 @click.command()
-@click.option("--out", required=True, type=PATH, metavar="MODEL", help="Network to write (.npz).")
-@calibration_option
+@opt.file_option("--out", "MODEL", "Network to write (.npz).", required=True)
 @click.option(
     "--network",
     type=click.Choice(["cnn", "motorwise", "lstm"]),
     default="cnn",
-    help="A convolutional network, one that looks at every motor alike, or the paper's LSTM.",
+    help="cnn: convolutional. motorwise: the same network for every motor. lstm: the paper's.",
 )
-@click.option(
-    "--iterations",
-    type=click.IntRange(min=1),
-    default=6000,
-    help="Batches of 64 runs to learn from.",
-)
-@hypotheses_option(
+@opt.count_option("--iterations", 6000, "Number of batches, of 64 runs each.", least=1)
+@opt.hypotheses_option(
     "Hypotheses that the network distinguishes, such as healthy,motor_2:stuck. Default: the "
     "paper's nine classes."
 )
-@plugin_option
-@common_options
+@opt.plugin_option
+@opt.calibrated_robot_options()
 def train(
     out: Path,
-    calibration: Path | None,
     network: str,
     iterations: int,
     hypotheses: str | None,
-    robot: str,
-    seed: int,
+    robot: opt.RobotOptions,
 ) -> None:
     """Train a network on the imperfect twin, for `diagnose --method MODEL`.
 
     Runs come fresh from the generator, as various as real ones: no recorded failure is needed. Its
     probabilities are calibrated on simulated runs of the physics engine.
     """
-    from failuretwin.app.inputs import check_learning
+    from failuretwin.app.inputs import check_learning, parse_cli_hypotheses
     from failuretwin.data_knowledge.store import check_writable
-    from failuretwin.digital_model.calibrated_robot import load_calibration
-    from failuretwin.digital_model.robot import load_robot
 
     check_learning()
-    from failuretwin.app.inputs import parse_cli_hypotheses
     from failuretwin.decision.learned.storage import check_network_file, save_network
     from failuretwin.decision.training import TrainingPlan, train_network
 
     check_network_file(out)
     check_writable(out)
-    model = load_robot(robot)
-    known = load_calibration(calibration, model)
-    chosen = parse_cli_hypotheses(hypotheses, model)
-    plan = TrainingPlan(network, iterations, seed, hypotheses=chosen)
+    known = robot.known
+    chosen = parse_cli_hypotheses(hypotheses, robot.model)
+    plan = TrainingPlan(network, iterations, robot.seed, hypotheses=chosen)
     with progress_bar("training", iterations) as advance:
         diagnoser, alone, both = train_network(
             plan, known.robot, known.imperfections, lambda done: advance(1)
@@ -212,26 +177,23 @@ def train(
 
 
 @click.command()
-@click.option("--out", required=True, type=PATH, metavar="DIR", help="Folder for everything.")
-@click.option(
-    "--test",
-    "test_path",
-    type=PATH,
-    metavar="PATH",
-    help="Real runs to test on. Default: runs of the physics engine, as a stand-in.",
+@opt.file_option("--out", "DIR", "Folder for everything.", required=True)
+@opt.file_option(
+    "--test test_path",
+    "PATH",
+    "Real runs to test on. Default: runs of the physics engine, as a stand-in.",
 )
-@published_labels_option
-@click.option("--quick", is_flag=True, help="A small version of about two minutes.")
-@click.option("--resume", is_flag=True, help="Go on with a study that was cut short.")
-@common_options
+@opt.published_labels_option
+@opt.flag_option("--quick", "A small version of about two minutes.")
+@opt.flag_option("--resume", "Continue an interrupted study.")
+@opt.robot_options
 def study(
     out: Path,
     test_path: Path | None,
     published_labels: bool,
     quick: bool,
     resume: bool,
-    robot: str,
-    seed: int,
+    robot: opt.RobotOptions,
 ) -> None:
     """Repeat the paper's study: train its network on the published twin, test it, write a page.
 
@@ -241,13 +203,11 @@ def study(
     from failuretwin.app.inputs import check_learning
     from failuretwin.app.reports.plots import figure_class
     from failuretwin.app.reports.study_page import write_study_page
-    from failuretwin.core.errors import InputError
     from failuretwin.decision.learned import paper_study as paper
-    from failuretwin.digital_model.robot import load_robot
 
     if published_labels and test_path is None:
         raise InputError("--published-labels says how to read a test set. Add --test PATH.")
-    model = load_robot(robot)
+    model, seed = robot.model, robot.seed
     plan = paper.quick_plan(seed) if quick else paper.StudyPlan(seed)
     paper.check_folder(out, resume)
     figure_class()  # better told before the work than after it

@@ -4,171 +4,106 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
-from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import click
 
-from failuretwin.app.commands.options import (
-    EMULATED,
-    PATH,
-    LiveOptions,
-    ProbeOptions,
-    SafetyOptions,
-    calibration_option,
-    common_options,
-    live_options,
-    plugin_option,
-    probe_options,
-    refuse_unused,
-    safety_options,
-)
-from failuretwin.app.terminal import console, tell
+from failuretwin.app.commands import options as opt
+from failuretwin.app.terminal import console, tell, until_interrupted
 
 if TYPE_CHECKING:
     from failuretwin.connection.links.base import Commander
-    from failuretwin.digital_model.nonidealities import Imperfections
 
 
 PROBING = ("idle", "move", "speed_share", "floor", "radius")
-"""Options of `watch` that say how it moves an arm."""
+"""Options of `watch` for its movements of the arm."""
 
 
 @click.command()
 @click.argument("source", metavar="SOURCE")
-@calibration_option
-@click.option(
+@opt.file_option(
     "--record",
-    type=PATH,
-    metavar="FILE.mcap",
-    help="Record readings, commands and diagnoses; Foxglove, PlotJuggler and failuretwin read it.",
+    "FILE.mcap",
+    "Record readings, commands and diagnoses; Foxglove, PlotJuggler and failuretwin read it.",
 )
 @click.option(
     "--false-alarms-per-100h",
     "budget",
     type=click.FloatRange(0.0, 1000.0, min_open=True),
     default=1.0,
-    show_default=True,
     metavar="N",
-    help="False alarms that you allow in 100 hours of work; fewer come later.",
+    help="Budget of false alarms in 100 hours of work. A smaller one delays alarms.",
 )
 @click.option(
     "--sensing",
     type=click.Choice(["tool", "tool+encoders", "tool+goals", "tool+encoders+goals"]),
     default="tool",
-    show_default=True,
-    help="What is believed beside the tool's position. encoders: what motors report of themselves, "
-    "such as /joint_states; errors show sooner, but a wrong reading is taken for the motor. goals: "
-    "which goal they report to have received; a stuck motor shows sooner.",
+    help="Sensors to use. tool: its position. encoders: joint angles that the motors report, such "
+    "as /joint_states; errors show sooner, but a wrong reading is taken for the motor. goals: the "
+    "goals that they report to have received; a stuck motor shows sooner.",
 )
-@probe_options
-@safety_options
-@live_options
-@plugin_option
-@common_options
+@opt.probe_options
+@opt.safety_options
+@opt.live_options
+@opt.plugin_option
+@opt.calibrated_robot_options()
 def watch(
     source: str,
-    calibration: Path | None,
     record: Path | None,
     budget: float,
     sensing: str,
-    probe: ProbeOptions,
-    safety: SafetyOptions,
-    live: LiveOptions,
-    robot: str,
-    seed: int,
+    probe: opt.ProbeOptions,
+    safety: opt.SafetyOptions,
+    live: opt.LiveOptions,
+    robot: opt.RobotOptions,
 ) -> None:
-    """Watch a robot as a digital shadow: it listens, says what is wrong, and moves nothing.
+    """Watch a robot as a digital shadow: listen, report faults, and move nothing.
 
-    With --probe N it may ask: while a fault is suspected and nobody commands the arm, it is moved
-    to settle which, and back. Each order passes the gate of `act` (--speed-share, --floor,
-    --radius); any command of others ends it.
+    With --probe N, `watch` moves the arm to identify a suspected fault, and back, while nobody else
+    commands it. Each order passes the gate of `act` (--speed-share, --floor, --radius); any command
+    of others ends it.
 
     SOURCE is `ros1`, `ros2[://HOST[:PORT]]` (over Zenoh), `rosbridge://HOST[:PORT]`, `emulated` (a
-    robot that exists only as physics), a log to replay (a raw session, a bag, a recording), or a
-    source of your own, MODULE:CLASS, made as failuretwin.connection.links.base.Source says. On a
-    ROS network the diagnosis is
+    robot simulated by physics), a log to replay (a raw session, a bag, a recording), or your own
+    source, MODULE:CLASS, a class that follows failuretwin.Source. On a ROS network the diagnosis is
     published on /diagnostics. Stop with Ctrl-C.
     """
     from contextlib import ExitStack
 
     from failuretwin.app.arms import connect
-    from failuretwin.app.live import fit_of, watch_until_end
+    from failuretwin.app.live import basis_line, fit_of, watch_until_end
     from failuretwin.app.shadow import Shadow
     from failuretwin.connection.links.recorder import Recorder
     from failuretwin.connection.links.ros_topics import load_topics
     from failuretwin.connection.links.statuses import statuses
     from failuretwin.decision.streaming.monitor import monitor
     from failuretwin.decision.test_motions.probing import Prober
-    from failuretwin.digital_model.calibrated_robot import load_calibration
-    from failuretwin.digital_model.robot import load_robot
 
     if not probe.probes:
-        refuse_unused("nothing is moved without --probe N", *PROBING)
-    model = load_robot(robot)
-    known, motors = load_calibration(calibration, model), model.motor_names
+        opt.refuse_unused("nothing is moved without --probe N", *PROBING)
+    model, known = robot.model, robot.known
     diagnoser = monitor(known.twin, known.imperfections, budget, sensing)
     wait_s = load_topics(live.topics).wait_s
-    when = "" if calibration is None else _written(calibration)
-    limit = "" if "goals" in sensing else _limit(known.imperfections, motors, budget)
-    tell(_rests_on(known.imperfections, when) + limit)
+    tell(basis_line(known, robot.calibration, budget, "goals" in sensing))
     # An emulated robot ends by itself, a log when it is over.
-    length = live.seconds if live.seconds and source != EMULATED else math.inf
+    length = live.seconds if live.seconds and source != opt.EMULATED else math.inf
     with ExitStack() as stack:
         probing = probe.probes > 0
-        link, sinks = connect(source, model, live, seed, stack, takes_orders=probing)
+        link, sinks = connect(source, model, live, robot.seed, stack, takes_orders=probing)
         prober = None
         if probing:
             commander, rules = cast("Commander", link), probe.rules(source, wait_s)
-            prober = Prober(diagnoser, safety.gate(known.robot), commander, rules, seed)
+            prober = Prober(diagnoser, safety.gate(known.robot), commander, rules, robot.seed)
             sinks.append(prober)
         if record is not None:
             sinks.append(stack.enter_context(Recorder(record, model)))
         shadow = Shadow(link, diagnoser, known.twin, sinks, wait_s)
-        try:
-            until = time.monotonic() + length
-            watch_until_end(shadow, console(), until, prober)
-        except KeyboardInterrupt:
-            tell("stopped")
-    arm = statuses(shadow.snapshot.answer, motors)[0]
+        with until_interrupted():
+            watch_until_end(shadow, console(), time.monotonic() + length, prober)
+    arm = statuses(shadow.snapshot.answer, model.motor_names)[0]
     tell(fit_of(diagnoser))
     tell(f"last answer: {arm.message}")
-
-
-def _written(calibration: Path) -> str:
-    """Return when the file of a calibration was written; empty where it is none of a path."""
-    if not calibration.is_file():
-        return ""
-    return f", written {date.fromtimestamp(calibration.stat().st_mtime).isoformat()}"
-
-
-def _rests_on(known: Imperfections, when: str) -> str:
-    """Return what the answers rest on, in one sentence; `when` says of when it is."""
-    from failuretwin.digital_model.arm_classes import GENERIC_NAME
-
-    if known.name != GENERIC_NAME:
-        return f"healthy behaviour: {known.name} ({known.protocol}; {known.source}{when})"
-    return (
-        f"healthy behaviour: {known.name}; {known.source}. What this robot does is not known yet: "
-        "it is learned as it works, and until then faults take longer to show. --calibration FILE "
-        "uses what was learned before"
-    )
-
-
-def _limit(known: Imperfections, motors: Sequence[str], budget: float) -> str:
-    """Return what losses of commands cost: the motor that takes longest to be told stuck."""
-    from failuretwin.decision.streaming.alarm_rule import movements_to_tell
-
-    needed = movements_to_tell(known, motors, budget)
-    if not needed:
-        return ""
-    worst = max(needed, key=lambda motor: needed[motor])
-    return (
-        f". At these losses a {worst.replace('_', ' ')} that sticks at rest takes about "
-        f"{needed[worst]} movements to be told from lost commands"
-    )
 
 
 @click.command()
@@ -181,34 +116,28 @@ def _limit(known: Imperfections, motors: Sequence[str], budget: float) -> str:
     "at once: one minute, or until 20 s after the last fault has begun or been repaired, unless "
     "--seconds says otherwise.",
 )
-@click.option(
+@opt.flag_option(
     "--obey",
-    is_flag=True,
-    help="Do what the topic of commands says, such as what `failuretwin act` orders, instead of "
-    "moving at random.",
+    "Obey the topic of commands, such as the orders of `failuretwin act`, instead of moving "
+    "at random.",
 )
-@live_options
-@click.option(
-    "--calibration",
-    metavar="none|NAME|FILE",
-    help="What the robot does that its twin does not. Default: what is known of it.",
-)
-@plugin_option
-@common_options
+@opt.live_options
+@opt.plugin_option
+@opt.calibrated_robot_options()
 def emulate(
     target: str,
     obey: bool,
-    live: LiveOptions,
-    calibration: str | None,
-    robot: str,
-    seed: int,
+    live: opt.LiveOptions,
+    robot: opt.RobotOptions,
 ) -> None:
-    """Play a robot: random movements, the imperfections of a real arm, faults on a schedule.
+    """Emulate a robot: random movements, the imperfections of a real arm, faults on a schedule.
 
-    Needs no robot. Watch it with `failuretwin watch ros1`.
+    No real robot is needed. Watch it with `failuretwin watch ros1`.
     """
     from failuretwin.app import emulating
-    from failuretwin.digital_model.robot import load_robot
+    from failuretwin.app.arms import emulation_with, known_arm
 
+    known = known_arm(robot.model, robot.calibration)
+    emulation = emulation_with(live.faults, known, robot.seed)
     emulate_on = emulating.obey if obey else emulating.play
-    emulate_on(target, load_robot(robot), live, calibration, seed)
+    emulate_on(target, emulation, live)

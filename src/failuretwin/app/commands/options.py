@@ -1,27 +1,48 @@
-"""Options that several commands share: logs, live robots, and the arm that is moved."""
+"""Options that several commands share: robots, logs, live robots, and the arm that is moved."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 from click.core import ParameterSource
 
+import failuretwin as ft
+from failuretwin.core.errors import InputError
+
 if TYPE_CHECKING:
+    import xarray as xr
+
+    from failuretwin.data_knowledge.readers.raw_sessions import As
     from failuretwin.decision.acting.safety import SafetyGate
     from failuretwin.decision.test_motions.probing import ProbeRules
-    from failuretwin.digital_model.robot import Robot
+    from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 PATH = click.Path(path_type=Path)
 EMULATED = "emulated"
-"""Name of an emulated arm, where others name a network."""
+"""Name of an emulated arm, in place of a network."""
+
+
+def file_option(flag: str, metavar: str, text: str, **more: Any) -> Callable[[F], F]:
+    """Return an option that takes a path; the name of the parameter may follow the flag."""
+    return click.option(*flag.split(), type=PATH, metavar=metavar, help=text, **more)
+
+
+def count_option(flag: str, default: int, text: str, least: int = 0) -> Callable[[F], F]:
+    """Return an option that takes a number of things; the parameter's name may follow the flag."""
+    number = click.IntRange(min=least)
+    return click.option(*flag.split(), type=number, default=default, metavar="N", help=text)
+
+
+def flag_option(flag: str, text: str) -> Callable[[F], F]:
+    """Return an option that takes no value."""
+    return click.option(flag, is_flag=True, help=text)
 
 
 def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F], F]:
@@ -30,7 +51,8 @@ def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F],
     def decorate(command: F) -> F:
         @wraps(command)
         def with_one(**told: Any) -> Any:
-            own = {field.name: told.pop(field.name) for field in fields(kind)}
+            names = [field.name for field in fields(kind) if field.name in told]
+            own = {option: told.pop(option) for option in names}
             return command(**told, **{name: kind(**own)})
 
         decorated: Any = with_one
@@ -42,17 +64,12 @@ def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F],
 
 
 def refuse_unused(why: str, *names: str) -> None:
-    """Refuse options that would do nothing, where the user has given some.
+    """Raise InputError if the user has given options that have no effect here, and say why.
 
     Args:
-        why: Why they would do nothing, the beginning of a sentence.
+        why: The reason, the beginning of a sentence.
         names: Names of the parameters.
-
-    Raises:
-        InputError: If one was given.
     """
-    from failuretwin.core.errors import InputError
-
     context = click.get_current_context()
     given = [
         option.opts[0]
@@ -64,45 +81,54 @@ def refuse_unused(why: str, *names: str) -> None:
         raise InputError(f"{why}: leave out {' and '.join(given)}.")
 
 
-def common_options(command: F) -> F:
-    """Add `--robot` and `--seed`, which every verb has."""
-    command = click.option(
-        "--seed",
-        type=click.IntRange(min=0),
-        default=0,
-        help="Seed of whatever is drawn by chance.",
-    )(command)
-    return click.option(
+@dataclass(frozen=True)
+class RobotOptions:
+    """Values of `robot_options`: the robot, its calibration, and the seed of random draws."""
+
+    robot: str
+    seed: int
+    calibration: Path | None = None
+
+    @property
+    def model(self) -> ft.Robot:
+        """The robot of the profile."""
+        return ft.load_robot(self.robot)
+
+    @property
+    def known(self) -> CalibratedRobot:
+        """The robot with its servo loops and healthy behaviour."""
+        return ft.load_calibration(self.calibration, self.robot)
+
+
+_robot_and_seed = (
+    click.option(
         "--robot",
         default="armpi_fpv",
         metavar="NAME|PROFILE",
         help="A bundled robot, or the TOML profile of another.",
-    )(command)
-
-
-calibration_option = click.option(
-    "--calibration",
-    type=PATH,
-    metavar="FILE",
-    help="What `calibrate` learned of this robot. Default: the calibration its profile names.",
+    ),
+    count_option("--seed", 0, "Seed of random draws."),
 )
+robot_options = gathered(RobotOptions, "robot", *_robot_and_seed)
 
 
-class RenamedOption(click.Option):
-    """An option whose last name is an old one: it works, and the help leaves it out."""
-
-    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
-        """Return the name of the option and its help."""
-        shown = copy(self)
-        shown.opts = self.opts[:1]
-        return click.Option.get_help_record(shown, ctx)
-
-
-def report_option(text: str, *old_names: str) -> Callable[[F], F]:
-    """Return the option `--report DIR`."""
-    return click.option(
-        "--report", *old_names, cls=RenamedOption, type=PATH, metavar="DIR", help=text
+def calibrated_robot_options(default: str | None = None) -> Callable[[F], F]:
+    """Return `robot_options` with `--calibration`; None: as the robot's profile says."""
+    unless = "" if default else " Default: the calibration that the profile names."
+    calibration = click.option(
+        "--calibration",
+        type=PATH,
+        default=default,
+        metavar="FILE|NAME|generic|none",
+        help="Healthy behaviour of the robot: a file that `calibrate` wrote, the name of a bundled "
+        f"one, generic (that of its arm class) or none (that of the ideal twin).{unless}",
     )
+    return gathered(RobotOptions, "robot", calibration, *_robot_and_seed)
+
+
+def report_option(text: str) -> Callable[[F], F]:
+    """Return the option `--report DIR`."""
+    return click.option("--report", type=PATH, metavar="DIR", help=text)
 
 
 class HypothesesOption(click.Option):
@@ -122,7 +148,7 @@ def hypotheses_option(text: str) -> Callable[[F], F]:
 
 
 def plugin_option(command: F) -> F:
-    """Add `--plugin`, which makes fault modes known before anything else is read or told."""
+    """Add `--plugin`, which registers fault modes before other options are read."""
 
     def load(context: click.Context, option: click.Parameter, plugins: tuple[str, ...]) -> None:
         if plugins:
@@ -148,17 +174,15 @@ def json_option(text: str) -> Callable[[F], F]:
     return click.option("--json", "json_file", type=PATH, metavar="FILE", help=text)
 
 
-published_labels_option = click.option(
+published_labels_option = flag_option(
     "--published-labels",
-    is_flag=True,
-    help="Take the truth of raw sessions from folder names that end in _label_K and freeze the "
+    "Take the truth of raw sessions from folder names that end in _label_K and freeze the "
     "motor of labels 1-4 from sample 49 on, as the authors of the data did.",
 )
-topics_option = click.option(
+topics_option = file_option(
     "--topics",
-    type=PATH,
-    metavar="FILE.toml",
-    help="Names and types of the robot's ROS topics, see docs/live.md. Default: those of the data "
+    "FILE.toml",
+    "Names and types of the robot's ROS topics, see docs/live.md. Default: those of the data "
     "set's authors.",
 )
 fault_option = click.option(
@@ -174,17 +198,27 @@ fault_option = click.option(
 
 @dataclass(frozen=True)
 class LogOptions:
-    """Values of `reading_options`: how logs become runs."""
+    """Values of `reading_options`: logs, and how they become runs."""
 
+    logs: tuple[Path, ...]
     how: str
     published_labels: bool
     columns: Path | None
     approximate: bool
 
+    def runs(self, robot: ft.Robot) -> xr.Dataset:
+        """Return the runs of all logs as one run set."""
+        from failuretwin.app.inputs import read_inputs
+
+        how = cast("As", self.how)
+        options = ft.ReadOptions(how, self.published_labels, approximate=self.approximate)
+        return read_inputs(self.logs, robot, options, self.columns)
+
 
 reading_options = gathered(
     LogOptions,
     "reading",
+    click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG..."),
     click.option(
         "--as",
         "how",
@@ -194,17 +228,15 @@ reading_options = gathered(
         "straight lines as the authors published them.",
     ),
     published_labels_option,
-    click.option(
+    file_option(
         "--columns",
-        type=PATH,
-        metavar="MAP.toml",
-        help="What the columns of a CSV file (or the topics of a bag, or the angles of a LeRobot "
-        "data set) are. If MAP.toml does not exist, a guess is written there for you to check.",
+        "MAP.toml",
+        "Meaning of the columns of a CSV file (or the topics of a bag, or the angles of a LeRobot "
+        "data set). If MAP.toml does not exist, a guess is written there for you to check.",
     ),
-    click.option(
+    flag_option(
         "--approximate",
-        is_flag=True,
-        help="Published paths without commands: accept commands that reproduce the desired path "
+        "Published paths without commands: accept commands that reproduce the desired path "
         "only in the least-squares sense.",
     ),
 )
@@ -248,23 +280,17 @@ SPEED_SHARE = 0.5
 
 def move_option(when: str = "") -> Callable[[F], F]:
     """Return the option `--move`; `when` says which option it belongs to."""
-    return click.option(
+    return flag_option(
         "--move",
-        is_flag=True,
-        help=f"{when}Send orders to a real arm. Without it the orders are only shown. An emulated "
+        f"{when}Send orders to a real arm. Without it the orders are only shown. An emulated "
         "arm needs no --move.",
     )
 
 
-floor_option = click.option(
-    "--floor", type=float, metavar="METRES", help="Height of the floor. Default: the base."
-)
-radius_option = click.option(
-    "--radius",
-    type=click.FloatRange(min=0.0),
-    metavar="METRES",
-    help="Radius of the links, for the distance that they keep. Default: by the arm's reach.",
-)
+def place_option(default: str) -> Callable[[F], F]:
+    """Return the option `--on`, the arm that takes orders: emulated by default, or a real one."""
+    kinds = f"{EMULATED}|" * (default == EMULATED) + "ros1|ros2|rosbridge://HOST[:PORT]"
+    return click.option("--on", "place", default=default, metavar=kinds, help="The arm.")
 
 
 @dataclass(frozen=True)
@@ -280,13 +306,7 @@ class ArmOptions:
 arm_options = gathered(
     ArmOptions,
     "arm",
-    click.option(
-        "--on",
-        "place",
-        default=EMULATED,
-        metavar="emulated|ros1|ros2|rosbridge://HOST[:PORT]",
-        help="The arm.",
-    ),
+    place_option(EMULATED),
     fault_option,
     move_option(),
     topics_option,
@@ -301,7 +321,7 @@ class SafetyOptions:
     floor: float | None = None
     radius: float | None = None
 
-    def gate(self, robot: Robot) -> SafetyGate:
+    def gate(self, robot: ft.Robot) -> SafetyGate:
         """Return the gate that every order passes."""
         from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
 
@@ -329,27 +349,35 @@ class ProbeOptions:
 probe_options = gathered(
     ProbeOptions,
     "probe",
-    click.option(
-        "--probe",
-        "probes",
-        type=click.IntRange(min=0),
-        default=0,
-        metavar="N",
-        help="While a fault is suspected and the arm stands still, make N movements at most that "
-        "settle which, each with the way back. Default: 0, nothing moves.",
+    count_option(
+        "--probe probes",
+        0,
+        "Maximum number of diagnostic movements, each with the way back, while a fault is "
+        "suspected and the arm stands still. 0: nothing moves.",
     ),
     click.option(
         "--idle",
         type=click.FloatRange(min=1.0),
         default=10.0,
-        show_default=True,
         metavar="SECONDS",
-        help="With --probe: only so long after the last command of others was carried out.",
+        help="With --probe: minimum time after the last command of others was carried out.",
     ),
     move_option("With --probe: "),
 )
 
 
+_space = (
+    click.option(
+        "--floor", type=float, metavar="METRES", help="Height of the floor. Default: the base."
+    ),
+    click.option(
+        "--radius",
+        type=click.FloatRange(min=0.0),
+        metavar="METRES",
+        help="Radius of the links, for the distance that they keep. Default: by the arm's reach.",
+    ),
+)
+space_options = gathered(SafetyOptions, "safety", *_space)
 safety_options = gathered(
     SafetyOptions,
     "safety",
@@ -359,6 +387,5 @@ safety_options = gathered(
         default=SPEED_SHARE,
         help="Share of each motor's speed limit that may be used.",
     ),
-    floor_option,
-    radius_option,
+    *_space,
 )

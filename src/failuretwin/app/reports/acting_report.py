@@ -1,4 +1,4 @@
-"""Results of `act`, and what an arm can still reach, as tables and a picture."""
+"""Results of `act` and of `reach` as tables and a picture."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def result_parts(results: Sequence[TargetResult]) -> list[str | Table]:
 
 
 def by_motor_parts(motors: Sequence[MotorReach]) -> list[str | Table]:
-    """Return a row for each motor: what can be reached with it held, and where to park it."""
+    """Return a row for each motor: the reachable share with it held, and its best angle."""
     rows = []
     for motor in motors:
         left = f"leaves {motor.feedback_factor:.0%} of an error each time"
@@ -49,7 +49,7 @@ def by_motor_parts(motors: Sequence[MotorReach]) -> list[str | Table]:
 
 
 def map_parts(found: Reach, *, per_point: bool) -> list[str | Table]:
-    """Return what can be reached; `per_point`: with a row for each point."""
+    """Return the reachable points; `per_point`: with a row for each."""
     rows = []
     points = zip(found.points, found.miss_m, found.reached, strict=True)
     for number, (point, miss, reached) in enumerate(points, start=1):
@@ -64,7 +64,7 @@ def map_parts(found: Reach, *, per_point: bool) -> list[str | Table]:
 
 
 def save_map(maps: Sequence[Reach], folder: Path) -> None:
-    """Draw each map from above and from the side: filled what can be reached, hollow what cannot.
+    """Draw each map from above and from the side; reachable points are filled, others hollow.
 
     Raises:
         InputError: If matplotlib is missing.

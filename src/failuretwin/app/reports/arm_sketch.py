@@ -1,42 +1,40 @@
-"""A sketch of an arm as SVG, made from the forward kinematics of its chain.
+"""A sketch of an arm, made from the forward kinematics of its chain.
 
     T_k = T_k-1 T_pj,k A_k(q_k),    p_k = origin of T_k,    tool p = origin of T_n T_jt
 
 seen from the side: z of the base upwards, and across the horizontal direction in which the origins
-spread most. Joints are dots; a marked one is larger, ringed and named.
+spread most. Joints are dots with their number; a marked one is larger, ringed and named.
 """
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin.app.reports.plots import render_page
+from failuretwin.app.reports.plots import new_figure
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.kinematics import SerialChain
 from failuretwin.digital_model.robot import Robot
 
-WIDTH, HEIGHT, MARGIN = 320.0, 260.0, 44.0
-"""Size of the picture, and what is left free around the arm [px]."""
-APART_PX = 12.0
-"""Joints that are nearer to each other than this share a label."""
-LABEL_ROOM = 60.0
-"""Labels are centred no nearer to an edge than this [px]."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+APART = 0.05
+"""Distance below which joints share a label, as a share of the arm's extent."""
 BENT = 0.35
 """Share of the range from its middle by which joints are bent, so that no arm is one line."""
+LINKS, JOINTS = "#566069", "#1d2429"
+"""Colours of links and of joints without a mark."""
 
 
 @dataclass(frozen=True)
 class Mark:
-    """How a joint is marked.
-
-    Attributes:
-        colour: Of its ring and label.
-        sign: Letter in it.
-        label: What stands beside it.
-    """
+    """Mark of a joint: colour of ring and label, letter in the ring, label above it."""
 
     colour: str
     sign: str
@@ -76,64 +74,44 @@ def seen_from_the_side(places: FloatArray) -> FloatArray:
     return np.column_stack([across, places[:, 2]])
 
 
-def on_picture(seen: FloatArray) -> FloatArray:
-    """Return places on the picture, all in one scale, y downwards, (place, 2) [px]."""
-    low, extent = seen.min(axis=0), np.maximum(np.ptp(seen, axis=0), 1e-9)
-    room = np.array([WIDTH, HEIGHT]) - 2.0 * MARGIN
-    scale = float((room / extent).min())
-    free = 0.5 * (room - scale * extent)
-    right, up = (MARGIN + free + scale * (seen - low)).T
-    return np.column_stack([right, HEIGHT - up])
+def arm_sketch(robot: Robot, marks: Mapping[str, Mark]) -> Figure:
+    """Return the sketch; motors without a mark, by their names, are dots with their number."""
+    points = seen_from_the_side(joint_places(robot.loads.chain, resting_pose(robot)))
+    figure = new_figure(4.0, 3.3)
+    panel = figure.add_subplot(aspect="equal", adjustable="datalim")
+    panel.axis("off")
+    panel.margins(0.22, 0.12)
+    panel.plot(*points.T, color=LINKS, lw=5.0, solid_joinstyle="round", zorder=1)
+    panel.plot(*points[0], "_", ms=36.0, mew=2.5, color=JOINTS, clip_on=False)
+    panel.plot(*points[-1], "+", ms=12.0, mew=2.5, color=JOINTS)
+    numbers, rows = defaultdict[int, list[str]](list), Counter[int]()
+    for k, (name, place) in enumerate(zip(robot.motor_names, points[1:-1], strict=True)):
+        first, mark = _first_at(points[1:-1], k), marks.get(name)
+        if mark is None:
+            panel.plot(*place, "o", ms=8.0, color=JOINTS)
+            numbers[first].append(str(k + 1))
+            continue
+        panel.plot(*place, "o", ms=20.0, mew=3.5, mfc="white", color=mark.colour, clip_on=False)
+        _write(panel, mark.sign, place, (0, -4), "center", mark.colour)
+        _write(panel, mark.label, place, (0, 15 + 14 * rows[first]), "center", mark.colour)
+        rows[first] += 1
+    for k, together in numbers.items():
+        _write(panel, ", ".join(together), points[k + 1], (-9, 2), "right", LINKS)
+    return figure
 
 
-def arm_sketch(robot: Robot, marks: Mapping[str, Mark]) -> str:
-    """Return the sketch as an SVG element.
-
-    Args:
-        robot: The robot.
-        marks: How motors are marked, by their names; the others are dots with their number.
-    """
-    places = joint_places(robot.loads.chain, resting_pose(robot))
-    points = on_picture(seen_from_the_side(places))
-    values = {
-        "width": WIDTH,
-        "height": HEIGHT,
-        "points": points.tolist(),
-        "marks": list(marks.values()),
-        "plain": _plain_dots(robot, points[1:-1], marks),
-        "marked": _marked_dots(robot, points[1:-1], marks),
-    }
-    return render_page("arm.svg.j2", values)
+def _first_at(points: FloatArray, k: int) -> int:
+    """Return the first joint that is drawn at about the same place as joint k."""
+    near = np.linalg.norm(points - points[k], axis=1) < APART * np.ptp(points, axis=0).max()
+    return int(np.argmax(near))
 
 
-def _neighbours(points: FloatArray, k: int) -> list[int]:
-    """Return the joints that are drawn at about the same place as joint k, itself included."""
-    return np.flatnonzero(np.linalg.norm(points - points[k], axis=1) < APART_PX).tolist()
+def _write(
+    panel: Axes, text: str, at: FloatArray, offset: tuple[int, int], side: str, colour: str
+) -> None:
+    """Write a text with a white edge, `offset` points beside a place."""
+    from matplotlib.patheffects import withStroke
 
-
-def _plain_dots(
-    robot: Robot, points: FloatArray, marks: Mapping[str, Mark]
-) -> list[tuple[float, float, str]]:
-    """Return place and numbers of each joint without a mark; joints at one place share a label."""
-    names, dots = robot.motor_names, []
-    for k in [k for k, name in enumerate(names) if name not in marks]:
-        together = [i for i in _neighbours(points, k) if names[i] not in marks]
-        numbers = ", ".join(str(i + 1) for i in together) if together[0] == k else ""
-        dots.append((*points[k].tolist(), numbers))
-    return dots
-
-
-def _marked_dots(
-    robot: Robot, points: FloatArray, marks: Mapping[str, Mark]
-) -> list[tuple[float, float, float, float, Mark]]:
-    """Return place, place of the label, and mark of each marked joint."""
-    is_marked = np.array([name in marks for name in robot.motor_names])
-    dots = []
-    for k in np.flatnonzero(is_marked).tolist():
-        (x, y), row = points[k].tolist(), _neighbours(points, k).index(k)
-        at, up = float(np.clip(x, LABEL_ROOM, WIDTH - LABEL_ROOM)), y - 21.0 - 16.0 * row
-        over = (y - points[:, 1] > 0.0) & (y - points[:, 1] < LABEL_ROOM) & is_marked
-        if over.any() and not row:  # another mark is in the way: beside it, towards the middle
-            at, up = x + (LABEL_ROOM if x < 0.5 * WIDTH else -LABEL_ROOM), y + 5.0
-        dots.append((x, y, at, up, marks[robot.motor_names[k]]))
-    return dots
+    edge = [withStroke(linewidth=3.0, foreground="white")]
+    style: dict[str, Any] = {"ha": side, "color": colour, "weight": "bold", "path_effects": edge}
+    panel.annotate(text, (at[0], at[1]), offset, textcoords="offset points", fontsize=11, **style)

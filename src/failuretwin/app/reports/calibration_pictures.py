@@ -1,4 +1,4 @@
-"""Pictures of a calibration: what it expects, what is left, and how a ramp fits."""
+"""Pictures of a calibration: expected errors, residuals, and a ramp."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 
 from failuretwin.app.reports.plots import BLUE, GREY, RED, clean, new_figure
 from failuretwin.connection.calibration.cross_validation import ExampleTransient, Predictions
-from failuretwin.connection.calibration.result import HeldOut
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot, shown_unit
@@ -79,7 +78,7 @@ def load_figure(seen: Predictions, settling: Settling, robot: Robot) -> Figure:
 
 
 def expected_figure(seen: Predictions, robot: Robot) -> Figure:
-    """Return settled errors against what was expected of them, each channel a panel."""
+    """Return settled errors against expected ones, each channel a panel."""
     names, scale, unit = channels(robot, seen.of_motors)
     figure, panels = _panels(names)
     for k, (panel, name) in enumerate(zip(panels, names, strict=True)):
@@ -106,7 +105,7 @@ def _reach(expected: FloatArray, error: FloatArray) -> float:
 
 
 def quantile_figure(seen: Predictions, dof: float, robot: Robot) -> Figure:
-    """Return quantiles of what is left against those of the fitted Student t distribution."""
+    """Return quantiles of the residuals against those of the fitted Student t distribution."""
     from scipy.stats import beta, t
 
     figure, panels = _panels(channels(robot, seen.of_motors)[0])
@@ -139,22 +138,3 @@ def ramp_figure(ramp: ExampleTransient, robot: Robot) -> Figure:
         panel.plot(ramp.time, reading, ".", color="black", ms=6, label="readings")
     what = "angle" if ramp.of_motors else "position"
     return _finish(figure, panels, "time since the command [s]", f"{what} [{unit}]")
-
-
-def session_figure(held_out: Sequence[HeldOut], robot: Robot, of_motors: bool) -> Figure:
-    """Return the size of the settled error of each unseen session, before and after."""
-    names, scale, unit = channels(robot, of_motors)
-    figure = new_figure(WIDTH_IN, max(1.9, 0.34 * len(held_out) + 1.2))
-    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
-    rows = np.arange(len(held_out))[::-1]
-    before, after = (
-        scale * np.array([getattr(e, n) for e in held_out]) for n in ("before", "after")
-    )
-    for k, (panel, name) in enumerate(zip(panels, names, strict=True)):
-        panel.barh(rows + 0.19, before[:, k], 0.36, color=GREY, label="uncalibrated")
-        panel.barh(rows - 0.19, after[:, k], 0.36, color=BLUE, label="calibrated")
-        panel.set_title(name)
-        panel.set_yticks(rows, [entry.session for entry in held_out], fontsize=8)
-        panel.tick_params(axis="y", length=0)
-        panel.set_ylim(-0.6, len(held_out) - 0.4)
-    return _finish(figure, panels, f"settled error [{unit}]")

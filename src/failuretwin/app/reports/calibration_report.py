@@ -1,4 +1,4 @@
-"""What `calibrate` says: tables on the terminal, and one page to judge a calibration by.
+"""Report of `calibrate`: tables on the terminal, and one page.
 
 Parameters with intervals, held-out sessions, what was left out. The page is self-contained HTML and
 needs the extra `plots`.
@@ -8,24 +8,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin import __version__
 from failuretwin.app.reports.calibration_pictures import (
     channels,
     expected_figure,
     load_figure,
     quantile_figure,
     ramp_figure,
-    session_figure,
 )
 from failuretwin.app.reports.plots import png, render_page
 from failuretwin.app.reports.technician_page import Section
-from failuretwin.app.terminal import Table, figures_table, show
+from failuretwin.app.terminal import Part, Table, figures_table
 from failuretwin.connection.calibration.cross_validation import (
     example_transient,
     predict,
@@ -34,7 +31,7 @@ from failuretwin.connection.calibration.cross_validation import (
 from failuretwin.connection.calibration.result import Calibration, Parameter, mean_gain
 from failuretwin.connection.self_calibration import SelfCalibration
 from failuretwin.connection.tracked_diagnosis import Tracked
-from failuretwin.core.types import FloatArray
+from failuretwin.core.errors import counted
 from failuretwin.data_knowledge.store import filling
 from failuretwin.digital_model.robot import Robot, shown_unit
 from failuretwin.inference.explanation import joint_names_in
@@ -44,53 +41,73 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def print_calibration(found: Calibration, robot: Robot) -> None:
-    """Print everything that was learned and how far it can be trusted."""
+def calibration_parts(found: Calibration, robot: Robot) -> list[Part]:
+    """Return all learned parameters and their accuracy on unseen sessions."""
     way = "motor readings" if found.used_readings else "the tool path alone"
-    show(f"{robot.name}: {found.movements} settled movements of {found.runs} runs, {way}\n")
-    show(parameter_table(found.parameters, robot))
-    show(*(f"  {_title(p)}: {p.note}" for p in found.parameters if not p.identified))
-    show(*(f"  {remark}" for remark in found.remarks))
+    parts: list[Part] = [
+        f"{robot.name}: {found.movements} settled movements of {found.runs} runs, {way}\n",
+        parameter_table(found.parameters, robot),
+        *(f"  {remark}" for remark in found.remarks),
+    ]
     if found.left_out:
-        show(f"\nleft out: {left_out_line(found)}")
+        parts.append(f"\nleft out: {left_out_line(found)}")
     if found.held_out:
-        show("\nsessions predicted by what the others say (settled error)\n")
-        show(held_out_table(found, robot))
-    show(f"\n{verdict_line(found)}")
+        parts.append("\nsessions predicted by what the others say (settled error)\n")
+        parts.append(held_out_table(found, robot))
+    return [*parts, f"\n{verdict_line(found)}"]
 
 
-def print_population(found: Calibration, robot: Robot) -> None:
-    """Print what the robots of a fleet are like and what they differ by."""
-    show(f"{robot.name}: {found.imperfections.name}: {', '.join(found.sessions)}\n")
-    show(parameter_table(found.parameters, robot, "95 % of such robots"))
-    show(*(f"  {_title(p)}: {p.note}" for p in found.parameters if not p.identified))
+def population_parts(found: Calibration, robot: Robot) -> list[Part]:
+    """Return the mean and spread of a fleet's parameters."""
+    head = f"{robot.name}: {found.imperfections.name}: {', '.join(found.sessions)}\n"
+    return [head, parameter_table(found.parameters, robot, "95 % of such robots")]
 
 
 def parameter_table(
-    parameters: Sequence[Parameter], robot: Robot, interval: str = "95 % interval"
+    parameters: Sequence[Parameter], robot: Robot | None, interval: str = "95 % interval"
 ) -> Table:
-    """Return a row for each figure: value, interval, unit, and how far it lies from such robots.
+    """Return a row for each parameter: value, interval, unit, deviations from such robots, note.
 
     Args:
-        parameters: The figures.
-        robot: The robot, for the units that people read.
-        interval: What the interval is of.
+        parameters: The parameters.
+        robot: The robot, whose servo counts are shown; None: angles are shown in degrees.
+        interval: Heading of the interval.
     """
-    beside = any(p.deviations is not None for p in parameters)
+    compared = any(p.deviations is not None for p in parameters)
     rows = []
     for p in parameters:
-        scale, unit = shown_unit(p.unit, robot, p.motor)
-        value, low, high = (f"{scale * x:.4g}" for x in (p.value, p.low, p.high))
+        scale, unit = _unit(p, robot)
+        value, low, high = (
+            figure(scale * x, scale * (p.high - p.low)) for x in (p.value, p.low, p.high)
+        )
+        title = f"{p.name}, {p.motor}" if p.motor else p.name
         off = "" if p.deviations is None else f"{p.deviations + 0.0:+.1f} deviations"
-        known = "" if p.identified else "not identified"
-        own = (_title(p), value, f"{low} to {high}", unit)
-        rows.append((*own, *[off] * beside, known))
-    headings = ("parameter", "value", interval, "unit", *["from such robots"] * beside, "")
+        note = "" if p.identified else f"not identified: {p.note}"
+        rows.append((title, value, f"{low} to {high}", unit, *[off] * compared, note))
+    headings = ("parameter", "value", interval, "unit", *["from such robots"] * compared, "")
     return Table(headings, rows)
 
 
-def _title(parameter: Parameter) -> str:
-    return f"{parameter.name}, {parameter.motor}" if parameter.motor else parameter.name
+SHORT_S = 0.2
+"""Times below this are shown in milliseconds [s]."""
+
+
+def _unit(p: Parameter, robot: Robot | None) -> tuple[float, str]:
+    """Return factor and name of the unit in which a parameter is shown."""
+    shown = {"share": (100.0, "%"), "m": (1e3, "mm"), "-": (1.0, "")}
+    if p.unit == "s" and max(abs(p.low), abs(p.high)) < SHORT_S:
+        return 1e3, "ms"
+    if p.unit == "rad" and robot is None:
+        return float(np.rad2deg(1.0)), "deg"
+    return shown.get(p.unit) or (shown_unit(p.unit, robot, p.motor) if robot else (1.0, p.unit))
+
+
+def figure(value: float, width: float) -> str:
+    """Return a value with as many digits as an interval of this width leaves meaning."""
+    if width <= 0.0 or not np.isfinite(width):
+        return f"{value:.3g}"
+    decimals = int(np.clip(1 - np.floor(np.log10(width / 2.0)), 0, 6))
+    return f"{value + 0.0:.{decimals}f}"
 
 
 def held_out_table(found: Calibration, robot: Robot) -> Table:
@@ -109,12 +126,10 @@ def held_out_table(found: Calibration, robot: Robot) -> Table:
 def left_out_line(found: Calibration) -> str:
     """Return how many runs and movements were left out and why, in one line."""
     kinds = Counter((entry.movement == 0, entry.motor, entry.reason) for entry in found.left_out)
-    return "; ".join(_counted(count, *kind) for kind, count in kinds.most_common())
-
-
-def _counted(count: int, whole_run: bool, motor: str, reason: str) -> str:
-    what = ("run" if whole_run else "movement") + ("" if count == 1 else "s")
-    return f"{count} {what}: {motor} {reason}" if motor else f"{count} {what}: {reason}"
+    return "; ".join(
+        f"{counted(count, 'run' if whole else 'movement')}: {f'{motor} ' * bool(motor)}{reason}"
+        for (whole, motor, reason), count in kinds.most_common()
+    )
 
 
 def verdict_line(found: Calibration) -> str:
@@ -135,133 +150,6 @@ def verdict_line(found: Calibration) -> str:
     )
 
 
-# The rows of a calibration page: figures rounded as far as they are known, and interval bars.
-
-MEANING = {
-    "bias": "error of the resting motor that is there in every pose",
-    "compliance": "how far a motor gives way under the load torque of the arm",
-    "friction": "how far it stops short, seen in the direction of travel",
-    "scatter": "what is left, from movement to movement (scale of its Student t distribution)",
-    "tail_dof": "degrees of freedom of the scatter: 30 is nearly normal, 3 has heavy tails",
-    "delay, mean over runs": "dead time on top of the servo loop",
-    "ramp shortening, mean over runs": "share of its time by which a ramp ends early",
-    "lag": "time constant of a first-order lag on top of the servo loop",
-    "late starts": "movements that start late, all motors together",
-    "late start, median": "the median delay of a late start",
-    "readings stop, median": "time from a movement to the last reading before a late one",
-    "lost commands": "movements on time for which a motor does not get its command",
-    "lost commands when late": "the same for movements that start late",
-    "spoilt readings": "readings that are missing or out of range",
-    "loop gain P": "proportional gain of the servo loop, from step tests",
-    "loop gain I": "integral gain of the servo loop, from step tests",
-    "filter time": "time constant of the loop's input filter, from step tests",
-    "speed limit": "largest speed of the motor, from step tests",
-    "dead time": "time from a command to the first motion, from step tests",
-    "overshoot": "how far a step goes beyond where it settles",
-    "settling time after the ramp": "until a step stays where it settles",
-}
-TITLES = {"tail_dof": "tails"}
-SHORT_S = 0.2
-"""Times below this are shown in milliseconds [s]."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One parameter as text, with its 95 % interval, and where these stand on its bar [%].
-
-    Attributes:
-        who: The motors; empty for the whole robot.
-        tick: Where the value stands.
-        note: What is missing where the logs do not identify it.
-    """
-
-    who: str
-    value: str
-    interval: str
-    left: float
-    width: float
-    tick: float
-    identified: bool
-    note: str
-
-
-@dataclass(frozen=True)
-class Group:
-    """The same parameter of all motors; `zero` lies on the bars [%], None: beyond them."""
-
-    title: str
-    meaning: str
-    unit: str
-    zero: float | None
-    rows: tuple[Row, ...]
-
-
-def parameter_groups(found: Calibration, robot: Robot) -> list[Group]:
-    """Return the parameters as text, those of the same name together."""
-    by_name: dict[str, list[Parameter]] = {}
-    for parameter in found.parameters:
-        by_name.setdefault(parameter.name, []).append(parameter)
-    return [_group(name, members, robot) for name, members in by_name.items()]
-
-
-def _group(name: str, members: Sequence[Parameter], robot: Robot) -> Group:
-    scale, unit = _unit(members, robot)
-    ends = scale * np.array([(p.low, p.value, p.high) for p in members])
-    known = ends[[p.identified for p in members]]
-    low, high = _span(known if len(known) else ends)
-    width = high - low if high > low else 1.0  # all of them exactly the same
-    at = np.clip(100.0 * (ends - low) / width, 0.0, 100.0)
-    zero = -100.0 * low / width
-    return Group(
-        title=TITLES.get(name, name),
-        meaning=MEANING.get(name, ""),
-        unit=unit,
-        zero=zero if 0.0 <= zero <= 100.0 else None,
-        rows=tuple(map(_row, members, ends, at)),
-    )
-
-
-def _unit(members: Sequence[Parameter], robot: Robot) -> tuple[float, str]:
-    unit = members[0].unit
-    if unit == "share":
-        return 100.0, "%"
-    if unit == "s" and max(abs(p.high) for p in members) < SHORT_S:
-        return 1e3, "ms"
-    return (1.0, "") if unit == "-" else shown_unit(unit, robot)
-
-
-def _span(ends: np.ndarray) -> tuple[float, float]:
-    """Return the ends of the bars' common scale; it begins at zero unless that is far away."""
-    low, high = float(ends.min()), float(ends.max())
-    if low > 0.0 and low < 0.6 * high:
-        low = 0.0
-    margin = 0.04 * (high - low) or 1.0
-    return (low if low == 0.0 else low - margin), high + margin
-
-
-def _row(parameter: Parameter, ends: FloatArray, at: FloatArray) -> Row:
-    low, value, high = (figure(x, ends[2] - ends[0]) for x in ends)
-    told = parameter.identified
-    return Row(
-        who=parameter.motor.replace("_", " ").replace("+", ", "),
-        value=value if told else "",
-        interval=f"{low} to {high}" if told else "",
-        left=float(at[0]),
-        width=float(at[2] - at[0]),
-        tick=float(at[1]),
-        identified=told,
-        note=parameter.note,
-    )
-
-
-def figure(value: float, width: float) -> str:
-    """Return a value with as many digits as an interval of this width leaves meaning."""
-    if width <= 0.0 or not np.isfinite(width):
-        return f"{value:.3g}"
-    decimals = int(np.clip(1 - np.floor(np.log10(width / 2.0)), 0, 6))
-    return f"{value + 0.0:.{decimals}f}"
-
-
 # The page.
 
 
@@ -269,20 +157,17 @@ def write_calibration_page(
     found: Calibration, runs: xr.Dataset, robot: Robot, folder: Path
 ) -> None:
     """Write `index.html` into a folder; the runs are those learned from or judged on."""
-    units, better = robot.profile.servo_units, found.beats_uncalibrated
-    left_out = [(e.run, str(e.movement or "all"), f"{e.motor} {e.reason}") for e in found.left_out]
+    units = robot.profile.servo_units
     text = render_page(
         "calibration.html.j2",
         {
             "found": found,
             "robot": robot.name,
             "verdict": verdict_line(found).rstrip("."),
-            "grade": "unknown" if better is None else "good" if better else "bad",
-            "facts": _facts(found, settling_of(found, robot).payload),
+            "payload": settling_of(found, robot).payload,
             "sessions": held_out_table(found, robot),
-            "groups": parameter_groups(found, robot),
+            "parameters": parameter_table(found.parameters, robot),
             "count_deg": None if units is None else units.deg_per_count,
-            "left_out": Table(("run", "movement", "why"), left_out),
             "left_out_line": left_out_line(found),
             **_pictures(found, runs, robot),
         },
@@ -291,27 +176,11 @@ def write_calibration_page(
         (partial / "index.html").write_text(text, encoding="utf-8")
 
 
-def _facts(found: Calibration, payload: float) -> Table:
-    way = "the motors' own readings" if found.used_readings else "the tool path alone"
-    protocol = found.imperfections.protocol
-    rows = [
-        ("learned from", found.imperfections.source),
-        ("sessions", f"{len(found.sessions)}: {', '.join(found.sessions)}"),
-        ("that is", f"{found.movements} settled movements of {found.runs} runs, by {way}"),
-        ("protocol", f"{protocol}: healthy logs only, no recorded failure"),
-        ("payload", f"{payload} kg at the tool point" if payload else "none assumed"),
-        ("made by", f"failuretwin {__version__}"),
-    ]
-    return Table(("", ""), rows, header=False)
-
-
 def _pictures(found: Calibration, runs: xr.Dataset, robot: Robot) -> dict[str, Any]:
-    """Return those pictures that there is something to show in, by name, and what they are of."""
+    """Return the pictures that have data, by name, and the values of their captions."""
     seen, settling = predict(found, runs, robot), settling_of(found, robot)
     ramp = example_transient(found, runs, robot)
     figures = {}
-    if found.held_out:
-        figures["sessions"] = session_figure(found.held_out, robot, found.used_readings)
     if seen.counts.any():
         figures["expected"] = expected_figure(seen, robot)
         figures["quantiles"] = quantile_figure(seen, settling.tail_dof, robot)
@@ -327,12 +196,7 @@ def _pictures(found: Calibration, runs: xr.Dataset, robot: Robot) -> dict[str, A
 
 
 def taught_section(learned: SelfCalibration, robot: Robot) -> Section:
-    """Return what was learned, how far it lies from such robots, what each run taught of it.
-
-    Args:
-        learned: What some runs say together.
-        robot: The robot.
-    """
+    """Return the parameters learned from runs, and the information that each run added."""
     found = learned.calibration
     by_run = [
         (diagnosis.run, f"{nats:.2f}")
@@ -347,7 +211,7 @@ def taught_section(learned: SelfCalibration, robot: Robot) -> Section:
 
 
 def tracking_line(tracked: Tracked) -> str:
-    """Return what was learned of the runs, in one line."""
+    """Return the changes learned from the runs, in one line."""
     life, history = tracked.life, tracked.history
     parts = [f"{len(tracked.rows)} runs learned", f"{life.arrived} in all"]
     if tracked.known:

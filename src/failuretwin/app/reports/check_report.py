@@ -12,26 +12,25 @@ import numpy as np
 
 from failuretwin.app.reports.isolability_report import sizes_of_motor
 from failuretwin.app.reports.technician_page import Section, write_page
-from failuretwin.app.terminal import Table, figures_table
+from failuretwin.app.terminal import Part, Table, figures_table
 from failuretwin.core.errors import InputError, counted
 from failuretwin.data_knowledge.store import filling, write_records
 from failuretwin.decision.robot_state import robot_state
 from failuretwin.decision.test_motions.health_check import OPEN, CheckResult
-from failuretwin.decision.test_motions.motions import Motions
+from failuretwin.decision.test_motions.motions import Motions, write_motions
 from failuretwin.digital_model.robot import Robot
 
 ERROR = "steady_state_error"
 CHANGED = 3.0
-"""A zero or a play that differs from that of the check before by so many standard deviations has
-changed."""
+"""Difference to the check before from which a zero or play has changed [standard deviations]."""
 LIMIT = "green rules out what the last column says; smaller errors may be there"
-"""Said of a green light."""
+"""Remark on a green light."""
 LIKELY = 0.05
-"""Motors are named where it is open from this probability on."""
+"""Probability from which motors are named if the result is open."""
 
 
-def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[str | Table]:
-    """Return what a check found: the light, and what every motor showed."""
+def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[Part]:
+    """Return the result of a check: the light, and the figures of every motor."""
     diagnosis = result.diagnosis
     head = f"{result.light.upper()}: {diagnosis.verdict}"
     if result.light == OPEN and not diagnosis.undecided:
@@ -47,19 +46,13 @@ def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[str |
 
 
 def closing_lines(result: CheckResult, robot: Robot) -> list[str]:
-    """Return how a check ends: state of the robot, how surely, what to do; as on its page."""
+    """Return the last lines of a check: state, certainty and next step, as on its page."""
     state = robot_state([result.diagnosis], robot)
     return [state.line, f"what to do: {state.step}"]
 
 
 def write_check_page(results: Sequence[CheckResult], robot: Robot, folder: Path) -> None:
-    """Write the technician's page of checks into a folder.
-
-    Args:
-        results: Of one check, or of the logs of several.
-        robot: The robot.
-        folder: Where `index.html` goes.
-    """
+    """Write the technician's page of one check, or of the logs of several, into a folder."""
     diagnoses = [result.diagnosis for result in results]
     measured = [
         Section("What the check measured", tables=[motor_table(result, robot)])
@@ -71,11 +64,16 @@ def write_check_page(results: Sequence[CheckResult], robot: Robot, folder: Path)
         write_page(diagnoses, state, robot, partial / "index.html", sections=measured)
 
 
+def _shown(slides: bool) -> tuple[float, str]:
+    """Return factor and name of the unit in which positions of a motor are shown."""
+    return (1e3, "mm") if slides else (180.0 / np.pi, "deg")
+
+
 def motor_table(result: CheckResult, robot: Robot) -> Table:
-    """Return what each motor showed, zeros and play in degrees, of slides in millimetres."""
+    """Return zero and play of each motor, in degrees, of slides in millimetres."""
     found, shown, rows = result.offsets, result.shown, []
     for k, name in enumerate(robot.motor_names):
-        factor, unit = (1e3, "mm") if robot.slides[k] else (180.0 / np.pi, "deg")
+        factor, unit = _shown(robot.slides[k])
         rows.append([
             name,
             f"{result.by_motor.get(name, 0.0):.1%}",
@@ -115,7 +113,7 @@ def check_record(result: CheckResult, robot: Robot, seconds: float) -> dict[str,
     }
 
 
-# Checks that are kept: the same motions again, and what has changed since.
+# Kept checks: the same motions again, and the changes since.
 
 
 def kept_checks(path: Path) -> list[dict[str, Any]]:
@@ -144,14 +142,14 @@ def keep_check(path: Path, motions: Motions, checks: Sequence[dict[str, Any]]) -
 
 
 def changes(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """Return what has changed since a check of the same motions, a line each."""
+    """Return the changes since a check of the same motions, a line each."""
     lines = []
     for old, new in zip(before["motors"], now["motors"], strict=True):
         for what in ("zero", "play"):
             moved = new[what] - old[what]
             spread = float(np.hypot(new[f"{what}_deviation"], old[f"{what}_deviation"]))
             if abs(moved) > CHANGED * spread:
-                factor, unit = (1e3, "mm") if new["unit"] == "m" else (180.0 / np.pi, "deg")
+                factor, unit = _shown(new["unit"] == "m")
                 lines.append(
                     f"since {before['date'][:10]}: {what} of {new['motor']} changed by "
                     f"{factor * moved:+.2f} {unit} ({abs(moved) / spread:.1f} deviations)"
@@ -165,18 +163,27 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
 # Designs.
 
 
-def motion_lines(motions: Motions, robot: Robot) -> list[str | Table]:
-    """Return what is told to the motors, a row a movement, angles in degrees."""
-    factor = np.where(robot.slides, 1e3, 180.0 / np.pi)
+def motion_lines(motions: Motions, robot: Robot, written: Path | None = None) -> list[Part]:
+    """Return the movements of the motors, a row each; they go to a file if one is named.
+
+    Raises:
+        OutputError: If the file cannot be written.
+    """
+    saved = []
+    if written is not None:
+        write_motions(motions, robot, written)
+        saved = [f"written to {written}; nothing was moved"]
+    scales = [_shown(slides) for slides in robot.slides]
+    factor = np.array([scale for scale, _ in scales])
     rows = [
         [f"{k + 1}", f"{begin:.1f}", f"{ramp:.2f}", *(f"{x:.1f}" for x in factor * target)]
         for k, (begin, ramp, target) in enumerate(
             zip(motions.start_s, motions.ramp_s, motions.target, strict=True)
         )
     ]
-    units = ["mm" if slides else "deg" for slides in robot.slides]
-    heads = [f"{name} [{unit}]" for name, unit in zip(robot.motor_names, units, strict=True)]
+    heads = [f"{name} [{unit}]" for name, (_, unit) in zip(robot.motor_names, scales, strict=True)]
     return [
         f"{counted(len(rows), 'movement')} in {motions.duration_s:.1f} s",
         figures_table(["", "at [s]", "ramp [s]", *heads], rows),
+        *saved,
     ]

@@ -139,9 +139,9 @@ def save_picture(found: IsolabilityReport, robot: Robot, folder: Path) -> None:
 # Remarks of `diagnose` on the motions of its runs.
 
 MAX_MOTIONS = 3
-"""Motions that are looked at, spread evenly over the runs."""
+"""Number of motions that are examined, spread evenly over the runs."""
 MAX_COMPARED = 16
-"""More hypotheses take longer to tell apart than to diagnose; then the user is left to ask."""
+"""Maximum number of hypotheses; comparing more takes longer than the diagnosis."""
 
 
 def isolability_summary(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str]:
@@ -197,7 +197,7 @@ def group_lines(found: IsolabilityReport, robot: Robot) -> list[str]:
 
 
 def size_lines(found: IsolabilityReport, robot: Robot) -> list[str]:
-    """Return the smallest sizes that are found, and what is known of faults never found."""
+    """Return the smallest sizes that are found, and the bounds of faults never found."""
     hidden = [name for name, size in found.isolated.items() if size is None]
     lines = {
         "smallest faults that such motions show": found.isolated,

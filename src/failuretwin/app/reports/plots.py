@@ -1,4 +1,4 @@
-"""Pictures of diagnosed runs, and what all pages share. Needs the extra `plots`."""
+"""Pictures of diagnosed runs, and tools of all pages and pictures. Needs the extra `plots`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from failuretwin import __version__
 from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import AXES, unique_names
@@ -31,7 +32,7 @@ MM_PER_M = 1000.0
 TITLE_COLUMNS = 100
 """Letters of the title that fit on one line of the picture."""
 LONGEST_STEM = 80
-"""Most letters of a run's name that the name of its picture has; file systems take 255 bytes."""
+"""Maximum length of the name of a picture; file systems take 255 bytes."""
 BLUE, RED, GREY = "#1f5f99", "#c8402f", "#9aa3ab"
 SMALL: dict[str, Any] = {"fontsize": 8, "frameon": False}
 """How legends look."""
@@ -78,15 +79,7 @@ def plot_runs(
     folder: Path,
     chosen: Sequence[int],
 ) -> dict[int, Path]:
-    """Write a picture of each chosen run into `folder`; return the files by index of the run.
-
-    Args:
-        runs: All runs.
-        diagnoses: Of each, in their order.
-        twin: The twin of their robot.
-        folder: Where pictures go.
-        chosen: Indices of the runs that are drawn.
-    """
+    """Write a picture of each chosen run into `folder`; return the files by index of the run."""
     time = as_floats(runs["time"].values)
     names = [re.sub(r"[^\w.+-]+", "_", diagnoses[i].run)[:LONGEST_STEM] for i in chosen]
     written = {}
@@ -173,29 +166,22 @@ def render_page(template: str, values: Mapping[str, Any]) -> str:
         from jinja2 import Environment, PackageLoader, StrictUndefined
     loader = PackageLoader("failuretwin.app", "")
     pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
+    pages.globals["version"] = __version__
     return pages.get_template(template).render(values)
 
 
-# Picture of the reliability diagram.
-
-NAME = "reliability.png"
-"""Name of the picture in its folder."""
+# Reliability diagram.
 
 
 def write_reliability(evaluation: Evaluation, folder: Path) -> None:
-    """Write the picture into `folder`.
+    """Write `reliability.png` into `folder`.
 
     Raises:
         InputError: If no run got a verdict, or matplotlib is missing.
     """
     if evaluation.calibration is None:
         raise InputError("no run got a verdict, so there is no reliability to draw.")
-    figure = reliability_figure(evaluation.calibration.equal, evaluation.runs_and_protocol)
-    save_figure(figure, folder, NAME)
-
-
-def reliability_figure(bins: Reliability, title: str) -> Figure:
-    """Return how often verdicts are right by how sure they are, and how many there are."""
+    bins = evaluation.calibration.equal
     figure = new_figure(5.6, 6.4)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[4.0, 1.0])
     _plot_shares(upper, bins)
@@ -203,8 +189,8 @@ def reliability_figure(bins: Reliability, title: str) -> Figure:
     lower.set(xlabel="stated probability of the verdict", ylabel="runs")
     clean(upper)
     clean(lower)
-    figure.suptitle(title, fontsize=11)
-    return figure
+    figure.suptitle(evaluation.runs_and_protocol, fontsize=11)
+    save_figure(figure, folder, "reliability.png")
 
 
 def _plot_shares(panel: Axes, bins: Reliability) -> None:

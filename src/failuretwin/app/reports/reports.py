@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from failuretwin.app.terminal import Table, figures_table, show
+from failuretwin.app.terminal import Part, Table, figures_table
 from failuretwin.core.errors import counted
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.store import write_text
@@ -28,25 +28,26 @@ from failuretwin.inference.explanation import joint_names_in
 from failuretwin.inference.together.fault_course import FaultCourse
 
 MAX_EXPLAINED = 3
-"""Up to so many runs are explained in full on the screen."""
+"""Maximum number of runs that are explained in full on the screen."""
 MARKS = {True: "right", False: "WRONG", None: ""}
 """Marks of verdicts whose truth is known."""
 
 
-def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
-    """Print a row a run."""
+def diagnosis_parts(diagnoses: Sequence[Diagnosis]) -> list[Part]:
+    """Return a row a run; of a few runs, all that explains them."""
     known = any(d.truth is not None for d in diagnoses)
     headings = ("run", *(["truth", ""] if known else []), "verdict", "log")
-    show(Table(headings, [_diagnosis_row(d, known) for d in diagnoses]))
-    for d in diagnoses if len(diagnoses) <= MAX_EXPLAINED else ():
-        lines = (*d.explanation, *(f"the log: {remark}" for remark in d.quality))
-        show(f"\n{d.run}", *(f"  - {line}" for line in lines))
-    if len(diagnoses) > MAX_EXPLAINED:
-        shared = [
-            line for line in diagnoses[0].quality if all(line in d.quality for d in diagnoses)
-        ]
-        show(*(f"\nevery log: {line}" for line in shared))
-    show(f"\n{diagnoses[0].method}")
+    lines = []
+    if len(diagnoses) <= MAX_EXPLAINED:
+        for d in diagnoses:
+            said = (*d.explanation, *(f"the log: {remark}" for remark in d.quality))
+            lines += [f"\n{d.run}", *(f"  - {line}" for line in said)]
+    else:
+        first = diagnoses[0].quality
+        shared = [line for line in first if all(line in d.quality for d in diagnoses)]
+        lines = [f"\nevery log: {line}" for line in shared]
+    table = Table(headings, [_diagnosis_row(d, known) for d in diagnoses])
+    return [table, *lines, f"\n{diagnoses[0].method}"]
 
 
 def _diagnosis_row(d: Diagnosis, known: bool) -> list[str]:
@@ -56,9 +57,9 @@ def _diagnosis_row(d: Diagnosis, known: bool) -> list[str]:
 
 
 def state_lines(state: RobotState, together: bool) -> list[str]:
-    """Return the state over several runs and what to do, as the page says them, a line each.
+    """Return the state over several runs and the next step, as on the page, a line each.
 
-    Of one run its diagnosis says both, and of runs that were weighed together `course_lines`.
+    The diagnosis of a single run holds both; for runs weighed together see `course_lines`.
     """
     if together or state.runs < 2:
         return []
@@ -66,21 +67,21 @@ def state_lines(state: RobotState, together: bool) -> list[str]:
 
 
 def course_lines(course: FaultCourse | None, state: RobotState, robot: Robot) -> list[str]:
-    """Return what runs say together of their robot, and what to do; None: each was judged alone."""
+    """Return the verdict over all runs and the next step; None: each was judged alone."""
     if course is None:
         return []
     told = [f"over all runs: {joint_names_in(line, robot)}" for line in course.verdict]
     return [*told, f"what to do: {state.step}"]
 
 
-def print_scores(judged: Judged) -> None:
-    """Print how good the diagnoses are, if the truth of any run is known."""
+def score_parts(diagnoses: Sequence[Diagnosis] | Judged) -> list[Part]:
+    """Return how good the diagnoses are, if the truth of any run is known."""
+    judged = diagnoses if isinstance(diagnoses, Judged) else Judged.of(diagnoses)
     if not judged.diagnoses:
-        return
-    show(f"\n{score_line(judged)}")
-    if judged.as_unknown:
-        show(as_unknown_line(judged))
-    show("", class_table(judged.scores), "", _confusion_table(judged.scores))
+        return []
+    unknown = [as_unknown_line(judged)] if judged.as_unknown else []
+    tables = class_table(judged.scores), "", _confusion_table(judged.scores)
+    return [f"\n{score_line(judged)}", *unknown, "", *tables]
 
 
 def class_table(scores: scoring.Scores) -> Table:
@@ -105,21 +106,21 @@ def _confusion_table(scores: scoring.Scores) -> Table:
     )
 
 
-# What `evaluate` adds.
+# Scores of `evaluate`.
 
 
-def print_evaluation(evaluation: Evaluation, truth_given: bool) -> None:
-    """Print every score; without a run set given, no true onset or magnitude can be known."""
-    print_scores(evaluation.judged)
-    show(f"\nall {evaluation.runs_and_protocol}", summary_table(evaluation))
+def evaluation_parts(evaluation: Evaluation, truth_given: bool) -> list[Part]:
+    """Return every score; without a run set given, no true onset or magnitude can be known."""
+    parts = score_parts(evaluation.judged)
+    parts += [f"\nall {evaluation.runs_and_protocol}", summary_table(evaluation)]
     if evaluation.calibration is not None:
-        show("", _reliability_table(evaluation.calibration.equal))
+        parts += ["", _reliability_table(evaluation.calibration.equal)]
     if evaluation.coverage:
-        show("", coverage_table(evaluation.coverage))
-    elif truth_given:
-        show("\ncoverage of intervals: the truth names no onset or magnitude of a fault found")
-    else:
-        show("\ncoverage of intervals: needs true onsets and magnitudes, give --truth RUNS")
+        return [*parts, "", coverage_table(evaluation.coverage)]
+    why = "needs true onsets and magnitudes, give --truth RUNS"
+    if truth_given:
+        why = "the truth names no onset or magnitude of a fault found"
+    return [*parts, f"\ncoverage of intervals: {why}"]
 
 
 def summary_table(evaluation: Evaluation) -> Table:
@@ -194,14 +195,14 @@ def coverage_table(coverage: Sequence[scoring.Coverage]) -> Table:
     )
 
 
-def print_comparison(comparison: Comparison) -> None:
-    """Print how two methods differ on the same runs."""
-    show(f"\n{counted(comparison.runs, 'run')}, each by A and by B")
-    show(*(f"{name}: {value}" for name, value in comparison_rows(comparison)))
+def comparison_parts(comparison: Comparison) -> list[Part]:
+    """Return how two methods differ on the same runs."""
+    head = f"\n{counted(comparison.runs, 'run')}, each by A and by B"
+    return [head, *(f"{name}: {value}" for name, value in comparison_rows(comparison))]
 
 
 def comparison_rows(comparison: Comparison) -> list[tuple[str, str]]:
-    """Return name and value of whatever says how two methods differ."""
+    """Return name and value of each figure of a comparison."""
     split, (a, b) = comparison.split, comparison.as_unknown
     right = (
         f"both {split.both}, only A {split.first_only}, only B {split.second_only}, neither "

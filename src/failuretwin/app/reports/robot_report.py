@@ -4,57 +4,44 @@ from __future__ import annotations
 
 import math
 
-from failuretwin.app.terminal import Table, show
-from failuretwin.connection.calibration.result import Parameter
+from failuretwin.app.reports.calibration_report import parameter_table
+from failuretwin.app.terminal import Part, Table
 from failuretwin.connection.registration.fit import Registration
 from failuretwin.core.errors import counted
 from failuretwin.digital_model.kinematics import has_range
 from failuretwin.digital_model.urdf.file import UrdfJoint
 from failuretwin.digital_model.urdf.report import JointReport, UrdfReport
 
-SHOWN = {"m": (1e3, "mm"), "rad": (57.29577951308232, "deg")}
-"""Factor and name of the units that people read."""
 
-
-def print_registration(found: Registration) -> None:
-    """Print what was found and how far it can be trusted."""
-    profile = found.profile
-    show(f"{profile.name}: {found.poses} settled poses, the tool path alone\n")
-    rows = [_row(parameter) for parameter in found.parameters]
-    show(Table(("parameter", "value", "95 % interval", "unit", ""), rows, "lrrll"))
-    show(
+def registration_parts(found: Registration) -> list[Part]:
+    """Return the fitted parameters and their accuracy."""
+    parts: list[Part] = [
+        f"{found.profile.name}: {found.poses} settled poses, the tool path alone\n",
+        parameter_table(found.parameters, None),
         "\nthe tool is off at the median: "
         f"{found.before_mm:.3g} mm with the profile as it was, {found.frames_mm:.3g} mm with "
         f"frame, tool point and zeros fitted, {found.after_mm:.3g} mm with the geometry too, in "
         "poses that the fit had not seen",
         f"the sensor and what no geometry explains: {1e3 * found.noise_m:.2g} mm on each axis",
-    )
+    ]
     if found.not_told:
-        show("\nthe poses do not tell, and what the profile or the URDF says stands:")
-        show(*(f"  {line}" for line in found.not_told))
-    show(*(f"note: {line}" for line in found.remarks))
-
-
-def _row(parameter: Parameter) -> tuple[str, ...]:
-    factor, unit = SHOWN.get(parameter.unit, (1.0, parameter.unit))
-    value, low, high = (
-        f"{factor * x:.5g}" for x in (parameter.value, parameter.low, parameter.high)
-    )
-    title = f"{parameter.name}, {parameter.motor}" if parameter.motor else parameter.name
-    known = "" if parameter.identified else "not identified"
-    return title, value, f"{low} to {high}", unit, known
+        parts.append("\nthe poses do not tell, and what the profile or the URDF says stands:")
+        parts += [f"  {line}" for line in found.not_told]
+    return [*parts, *(f"note: {line}" for line in found.remarks)]
 
 
 # Joints and findings of a URDF.
 
 
-def print_urdf(report: UrdfReport) -> None:
-    """Print the chain, its joints and all findings that are no errors."""
+def urdf_parts(report: UrdfReport) -> list[Part]:
+    """Return the chain, its joints and all findings that are no errors."""
+    parts: list[Part] = []
     if report.joints:
         headings = ("joint", "type", "limits", "speed", "effort", "link mass", "motor")
-        show(_summary(report), Table(headings, [_joint_row(joint) for joint in report.joints]))
+        parts = [_summary(report), Table(headings, [_joint_row(joint) for joint in report.joints])]
     for severity in ("warning", "note"):
-        show(*(f"\n{severity}: {message}" for message in report.having(severity)))
+        parts += [f"\n{severity}: {message}" for message in report.having(severity)]
+    return parts
 
 
 def _summary(report: UrdfReport) -> str:

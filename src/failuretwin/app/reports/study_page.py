@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin import __version__
 from failuretwin.app.reports import plots
 from failuretwin.app.reports.plots import BLUE, GREY, MM_PER_M, RED, SMALL
 from failuretwin.app.terminal import Table
@@ -157,7 +156,6 @@ def write_study_page(
     values = {
         "plan": plan,
         "robot": robot.name,
-        "version": __version__,
         "test": test,
         "full": plan == StudyPlan(plan.seed),
         "accuracies": _table_2(trainings, test),

@@ -12,9 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from failuretwin import __version__
 from failuretwin.app.reports.arm_sketch import Mark, arm_sketch
-from failuretwin.app.reports.plots import plain, plot_runs, render_page
+from failuretwin.app.reports.plots import plain, plot_runs, png, render_page
 from failuretwin.app.terminal import Table
 from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, OPEN_STATE, Diagnosis
 from failuretwin.data_knowledge.store import filling
@@ -28,11 +27,11 @@ if TYPE_CHECKING:
     import xarray as xr
 
 MOST_PICTURES = 16
-"""Runs that get a picture and details."""
+"""Maximum number of runs with a picture and details."""
 MOST_PICTURE_BYTES = 3_000_000
-"""Size of all pictures together in the page [byte]."""
+"""Maximum size of all pictures of a page together [byte]."""
 MOST_ROWS = 2000
-"""Runs that get a row."""
+"""Maximum number of rows of the table of runs."""
 SHOWN = {
     HEALTHY_STATE: ("#2e7d4f", "✓"),
     FAULTY_STATE: ("#c8402f", "!"),
@@ -47,32 +46,28 @@ class _Row:
 
     Attributes:
         number: Its place among the runs, from 1.
-        diagnosis: What was said of it.
+        diagnosis: Its diagnosis.
         kind: Its state.
-        truth: What was the case, in plain words; empty: not known.
-        wrong: Whether the verdict is known to be wrong.
         picture: PNG file in base64; empty: none.
-        told: Whether it has details below.
+        detailed: Whether it has details below.
     """
 
     number: int
     diagnosis: Diagnosis
     kind: str
-    truth: str
-    wrong: bool
     picture: str
-    told: bool
+    detailed: bool
 
 
 @dataclass(frozen=True)
 class Section:
-    """What else a page tells, between its motors and its runs.
+    """Section of a page between its motors and its runs.
 
     Attributes:
         title: Its heading.
         lines: Sentences.
-        tables: Shown below them.
-        folded: Tables below those by what they tell, shown when asked for.
+        tables: Tables below them.
+        folded: Folded tables below those, by their title.
     """
 
     title: str
@@ -85,13 +80,8 @@ def chosen_runs(diagnoses: Sequence[Diagnosis], robot: Robot, most: int) -> list
     """Return the runs that are shown in full, in their order.
 
     Runs are grouped by state, faulty motors and whether their verdict is known to be wrong, and
-    taken in turn from each group, the surest first; a right one of every state comes before any
-    that is wrong.
-
-    Args:
-        diagnoses: Of all runs.
-        robot: The robot.
-        most: So many at most.
+    taken in turn from each group, the surest first, `most` in all; a right one of every state comes
+    before any that is wrong.
     """
     groups: dict[tuple[bool, str, tuple[str, ...]], list[int]] = {}
     for i, diagnosis in enumerate(diagnoses):
@@ -114,15 +104,10 @@ def write_report(
     folder: Path,
     sections: Sequence[Section] = (),
 ) -> None:
-    """Write the page of diagnosed runs into a folder, with the pictures that it holds as files.
+    """Write the page of diagnosed runs into a folder, and its pictures as files; see `write_page`.
 
-    Args:
-        runs: The runs.
-        diagnoses: Of each, in their order.
-        twin: The twin of their robot.
-        state: Of the robot over all of them.
-        folder: Where `index.html` goes.
-        sections: What else is told.
+    Raises:
+        OutputError: If it cannot be written.
     """
     chosen = chosen_runs(diagnoses, twin.robot, MOST_PICTURES)
     with filling(folder) as partial:
@@ -141,31 +126,32 @@ def write_page(
     """Write the page of some runs.
 
     Args:
-        diagnoses: Of each run.
-        state: Of the robot over all of them.
+        diagnoses: Diagnosis of each run.
+        state: State of the robot over all of them.
         robot: The robot.
         path: The file.
-        pictures: PNG files of some runs, by index; these runs are shown in full. None: of none,
-            and the first ones are shown in full.
-        sections: What else is told.
+        pictures: PNG files of the runs with details, by index; None: the first runs have details,
+            without pictures.
+        sections: Further sections.
     """
-    judged = Judged.of(diagnoses)
+    judged, marks = Judged.of(diagnoses), _marks(state)
     rows = _rows(diagnoses, pictures or dict.fromkeys(range(MOST_PICTURES)), robot)
     values: dict[str, Any] = {
         "state": state,
-        "sketch": arm_sketch(robot, _marks(state)),
+        "sketch": png(arm_sketch(robot, marks)),
+        "marked": ", ".join(mark.label for mark in marks.values()) or "no joint",
         "shown": SHOWN,
         "rows": rows[:MOST_ROWS],
-        "told": [row for row in rows if row.told],
+        "detailed": [row for row in rows if row.detailed],
         "count": len(diagnoses),
         "robot": robot.name,
         "sections": sections,
         "method": diagnoses[0].method,
         "protocol": diagnoses[0].protocol,
-        "version": __version__,
         "known": any(d.truth is not None for d in diagnoses),
         "score": score_line(judged),
         "as_unknown": as_unknown_line(judged),
+        "is_right": is_right,
         "plain": plain,
         "percent": percent,
     }
@@ -190,7 +176,5 @@ def _rows(
         held = held if spent + len(held) <= MOST_PICTURE_BYTES else ""
         spent += len(held)
         kind = state_of_run(diagnosis, robot.motor_names).kind
-        truth = "" if diagnosis.truth is None else plain(diagnosis.truth)
-        wrong = is_right(diagnosis) is False
-        rows.append(_Row(i + 1, diagnosis, kind, truth, wrong, held, i in pictures))
+        rows.append(_Row(i + 1, diagnosis, kind, held, i in pictures))
     return rows
