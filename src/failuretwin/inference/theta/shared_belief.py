@@ -44,6 +44,11 @@ class Normal:
         """Return those of some of the runs."""
         return Normal(self.precision[rows], self.shift[rows])
 
+    @property
+    def mean(self) -> FloatArray:
+        """(run, theta)."""
+        return np.asarray(np.linalg.solve(self.precision, self.shift[..., None])[..., 0])
+
 
 @dataclass(frozen=True)
 class Belief:
