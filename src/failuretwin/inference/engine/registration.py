@@ -113,11 +113,6 @@ def displaced_components(
     return Components.joined([one for one in found if np.isfinite(one.log_weight).any()])
 
 
-def _broad(frames: Components, noise_m: float) -> Components:
-    """Return one normal distribution that holds all displacements."""
-    return Components.normal_of(np.maximum.reduce(frames.covariance), noise_m)
-
-
 def _about(
     likelihood: RunLikelihood,
     hypotheses: Sequence[Hypothesis],
@@ -131,7 +126,8 @@ def _about(
     frames = displaced_components(model, priors.setup, layout, usual)
     noise = float(np.hypot(model.path_noise, share * model.twin.robot.reach))
     ranked = [h for h in hypotheses if has_rows(h)]
-    broad = _broad(frames, noise).about(np.pad(place, ((0, 0), (0, layout.size - REGISTRATION))))
+    broad = Components.normal_of(np.maximum.reduce(frames.covariance), noise)
+    broad = broad.about(np.pad(place, ((0, 0), (0, layout.size - REGISTRATION))))
     settled = replace(likelihood, moving=None)
     return Weighing(settled, ranked, priors, layout, broad, place)
 
@@ -158,26 +154,11 @@ def registered_together(
     for share in (COARSE_TO_FINE[1], 0.0, 0.0):
         weighing = _about(some, hypotheses, priors, np.tile(place, (len(rows), 1)), share)
         information, shift = (one.sum(axis=0) for one in theta_factors(weighing.evidence))
-        mean, covariance = weighing.components.mean[0, 0], weighing.components.covariance[0]
-        place = place + _newton(information, shift, mean, covariance)[:REGISTRATION]
+        broad = weighing.components
+        precision = np.linalg.inv(broad.covariance[0])
+        force = shift + precision @ broad.mean[0, 0]
+        place = place + np.linalg.solve(information + precision, force)[:REGISTRATION]
     return place
-
-
-def _newton(
-    information: FloatArray, shift: FloatArray, mean: FloatArray, covariance: FloatArray
-) -> FloatArray:
-    """Return the registration that runs share as a Newton step of theta, (theta,).
-
-    Args:
-        information: Sum of what the runs say of theta, (theta, theta).
-        shift: That times the theta that they point to, (theta,).
-        mean: Prior mean, (theta,).
-        covariance: Prior covariance, (theta, theta).
-    """
-    precision = np.linalg.inv(covariance)
-    step = np.linalg.solve(information + precision, shift + precision @ mean)
-    step[REGISTRATION:] = 0.0
-    return np.asarray(step)
 
 
 def sensor_in_doubt(
@@ -245,7 +226,7 @@ def robot_posterior(
 ) -> Posterior:
     """Return the posterior of runs whose sensor is where the profile says."""
     chunks = _chunks(len(likelihood.usable))
-    parts = [robot_weighing(likelihood[rows], hypotheses, priors) for rows in chunks]
+    parts = _robot_parts(likelihood, hypotheses, priors)
     return assembled(likelihood, [one.posterior() for one in parts], *_in_turn(chunks))
 
 
@@ -253,9 +234,15 @@ def robot_evidence(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> FloatArray:
     """Return log p(run | h) of runs whose sensor is where the profile says, (run, hypothesis)."""
-    chunks = _chunks(len(likelihood.usable))
-    parts = [robot_weighing(likelihood[rows], hypotheses, priors) for rows in chunks]
+    parts = _robot_parts(likelihood, hypotheses, priors)
     return np.concatenate([one.by_hypothesis for one in parts])
+
+
+def _robot_parts(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> list[Weighing]:
+    chunks = _chunks(len(likelihood.usable))
+    return [robot_weighing(likelihood[rows], hypotheses, priors) for rows in chunks]
 
 
 def displaced_posterior(

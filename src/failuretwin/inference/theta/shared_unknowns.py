@@ -1,13 +1,11 @@
 """What all movements of a run share and nobody has measured exactly: registration and offsets.
 
     x_seen = (1 + k) R(w) x + t,    angle = base + b + c g - f d
-    theta = (t, w, k, b, c, f),     r(theta + delta) = r(theta) - G delta
-    G = [ I | -[x]x | x | J | J diag(g) | -J diag(d) ]
+    theta = (t, w, k, b, c, f)
 
 with origin t [m], turn w [rad] and scale k of the tool sensor's frame about the robot's base frame,
-and bias b, compliance c and friction f of each motor beside those of the healthy model; G is the
-derivative of the expected position at x by theta, J its derivative by the angles, g the load
-torques and d the directions of travel.
+and bias b, compliance c and friction f of each motor beside those of the healthy model; g are load
+torques and d directions of travel. `engine.theta` has the columns of theta.
 
 Section: docs/inference.md#shared-unknowns
 """
@@ -51,48 +49,6 @@ class SharedLayout:
     def size(self) -> int:
         """Length of theta."""
         return REGISTRATION + 3 * self.motors * self.offsets
-
-    def own(self, motor: int) -> list[int]:
-        """Return the places of b [rad], c [rad/(N m)] and f [rad] of one motor, if in doubt."""
-        return [REGISTRATION + motor + self.motors * k for k in range(3)] if self.offsets else []
-
-
-def columns(
-    model: HealthyModel,
-    pose: FloatArray,
-    jacobian: FloatArray,
-    direction: FloatArray,
-    layout: SharedLayout,
-) -> FloatArray:
-    """Return G, the derivative of what is expected by theta, (..., channel, theta).
-
-    Registration is that of one sensor; the channels of others do not change with it.
-
-    Args:
-        model: The healthy robot.
-        pose: Angles at which the motors settle, (..., motor) [rad].
-        jacobian: J there, (..., channel, motor) [m/rad].
-        direction: Sign of their last travel, (..., motor).
-        layout: What stands in theta.
-    """
-    rigid = [_rigid(model, pose)]
-    if not layout.offsets:
-        return np.concatenate(rigid, axis=-1)
-    load = loads(model, pose)[..., None, :]
-    parts = [*rigid, jacobian, jacobian * load, -jacobian * direction[..., None, :]]
-    return np.concatenate(parts, axis=-1)
-
-
-def _rigid(model: HealthyModel, pose: FloatArray) -> FloatArray:
-    """Return the columns of t, w and k, (..., channel, 7)."""
-    value, own = model.sensors.value(pose), model.sensors.registered
-    found = np.zeros((*value.shape, REGISTRATION))
-    if own is not None:
-        x = value[..., own]
-        found[..., own, ORIGIN] = np.eye(3)
-        found[..., own, TURN] = np.swapaxes(np.cross(np.eye(3), x[..., None, :]), -1, -2)
-        found[..., own, SCALE] = x[..., None]
-    return found
 
 
 def loads(model: HealthyModel, pose: FloatArray) -> FloatArray:
