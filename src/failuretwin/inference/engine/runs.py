@@ -130,12 +130,19 @@ class RunsEvidence:
         return {}
 
     @cached_property
+    def left_out(self) -> dict[int, FloatArray]:
+        """Log of all rows over those that are kept, by hypothesis, (run,): they count as these."""
+        return {}
+
+    @cached_property
     def weighed(self) -> list[Weighed]:
         """What the rows of each hypothesis say, by the components that weigh them."""
         first = [self.weigh(h, self._all_rows(h)) for h in range(len(self.rows))]
         for h, one in enumerate(first):
             self.narrowed[h] = self._narrowed(h, one)
         kept = [self._near_best(h, one) for h, one in enumerate(first)]
+        for h, one in enumerate(first):
+            self.left_out[h] = self._left_out(h, one, kept[h])
         wanted = self._wanted(first)
         widest = self._widest(wanted)
         runs = np.arange(len(wanted))
@@ -241,6 +248,14 @@ class RunsEvidence:
         run, row = np.nonzero((table > best - ROWS_NATS) & (table >= least))
         return Picks(run, row, np.zeros_like(row))
 
+    def _left_out(self, h: int, one: Weighed, kept: Picks) -> FloatArray:
+        table: FloatArray = np.full(self.rows[h].log_prior.shape, -np.inf)
+        table[one.picks.run, one.picks.row] = one.log_evidence
+        some = np.full_like(table, -np.inf)
+        some[kept.run, kept.row] = table[kept.run, kept.row]
+        whole, part = log_sum(table, axis=1), log_sum(some, axis=1)
+        return np.where(np.isfinite(part), whole - np.where(np.isfinite(part), part, 0.0), 0.0)
+
     def _wanted(self, first: Sequence[Weighed]) -> BoolArray:
         """Return which components weigh each run in full, (run, component)."""
         runs, count = self.scene.moments.runs, len(self.components)
@@ -296,6 +311,8 @@ class RunsEvidence:
         ready = part.filter_rows
         found = filter_rows(ready) if before is None else refine(ready, before)
         total = found.total + rows.log_prior[picks.run, picks.row]
+        if h in self.left_out:
+            total = total + self.left_out[h][picks.run]
         amount = found.amount.copy()
         amount[:, 1] = np.sqrt(np.maximum(amount[:, 1], 0.0))
         amount[:, 0] += rows.centre[picks.run, picks.row]

@@ -32,7 +32,10 @@ SAMPLED_RUNS = 32
 """Runs that tell whether the sensor may be displaced."""
 AS_HEALTHY, COARSE = 2, 0.004
 """First passes, in which every run counts as healthy, and noise of the sensor in the very first, as
-a share of the reach: what all runs share must not look like a fault of each."""
+a share of the reach: what all runs share must not look like a fault of each. Scatter and losses are
+learned after them."""
+OPEN = AS_HEALTHY + 2
+"""Pass from which hypotheses that are out of the question for a run are left out of the next."""
 DAMPING = 0.7
 """Share of a new site that is taken, from the second pass on."""
 Advance = Callable[[int], None]
@@ -106,9 +109,9 @@ def folder_posterior(
         if last:
             break
         before = together.here
-        if not as_healthy:
+        if done >= OPEN:
             likely = np.concatenate([each.likely for each in found])
-        together.learn(found, 1.0 if done == 0 else DAMPING)
+        together.learn(found, 1.0 if done == 0 else DAMPING, float(done > AS_HEALTHY))
         (_,), (covariance,) = together.belief.moments
         spread = together.unit * np.sqrt(np.diag(covariance))
         moved = float(np.abs((together.here - before) / spread).max())
