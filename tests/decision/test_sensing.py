@@ -184,7 +184,7 @@ def test_an_accelerometer_alone_cannot_tell_what_gravity_does_not_show(runs):
     found = ft.diagnose(runs, sensing="accelerometer")
     for diagnosis in found[:4]:
         p = diagnosis.posterior
-        assert p["motor_1:steady_state_error"] == pytest.approx(p["healthy"], rel=0.3)
+        assert p["motor_1:steady_state_error"] == pytest.approx(p["healthy"], rel=0.05)
     for diagnosis in found[9:]:  # of the first two movements only can be used
         parallel = [diagnosis.posterior[f"motor_{k}:steady_state_error"] for k in (2, 3, 4)]
         assert sum(parallel) > 0.6

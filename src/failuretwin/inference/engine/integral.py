@@ -24,7 +24,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from scipy.optimize import least_squares
 
-from failuretwin.core.numerics import log_fall, log_norm
+from failuretwin.core.numerics import log_fall, log_norm, log_sum
 from failuretwin.core.types import FloatArray, IntArray, as_floats
 
 NORMALS = 5
@@ -153,7 +153,7 @@ def moment_posterior(
     surplus = 0.5 * (mixture.residual.shape[-1] - dims) * np.log(factors)
     term = mixture.log_weight[rows, kept][..., None] + log_omega - surplus
     term = term - 0.5 * (square + log_determinant + dims * np.log(2.0 * np.pi))
-    rest = glance.copy()
+    rest = glance + _ratio(term, glance[rows, kept])[:, None]
     np.put_along_axis(rest, kept, -np.inf, axis=1)
     top = np.maximum(np.maximum(term.max(axis=(1, 2)), rest.max(axis=1)), noise.log_outlier)
     share = np.exp(term - top[:, None, None])
@@ -161,12 +161,29 @@ def moment_posterior(
     sum_of_all = share.sum(axis=(1, 2)) + left.sum(axis=1) + np.exp(noise.log_outlier - top)
     share /= sum_of_all[:, None, None]
     left /= sum_of_all[:, None]
-    alpha = np.einsum("raq,raqi->ri", share, pull)
-    curvature = np.einsum("raq,raqij->rij", share, solved)
-    curvature -= np.einsum("raq,raqi,raqj->rij", share, pull, pull, optimize=True)
+    of_kept = share.sum(axis=(1, 2))  # those that are left pull as these do
+    counted = share * (1.0 + left.sum(axis=1) / np.maximum(of_kept, 1e-300))[:, None, None]
+    alpha = np.einsum("raq,raqi->ri", counted, pull)
+    curvature = np.einsum("raq,raqij->rij", counted, solved)
+    curvature -= np.einsum("raq,raqi,raqj->rij", counted, pull, pull, optimize=True)
     curvature += alpha[:, :, None] * alpha[:, None]
     np.put_along_axis(left, kept, share.sum(axis=2), axis=1)
     return MomentPosterior(top + np.log(sum_of_all), alpha, curvature, left)
+
+
+def _ratio(term: FloatArray, glance: FloatArray) -> FloatArray:
+    """Return the log of what kept outcomes say over their density at the first glance, (row,).
+
+    The glance takes what is not known of f for the scale of the Student t. The outcomes that are
+    left count as wrongly as those that are kept.
+
+    Args:
+        term: Integrals of the kept outcomes, (row, kept, normal).
+        glance: Their density, (row, kept).
+    """
+    exact, rough = log_sum(term, axis=(1, 2)), log_sum(glance, axis=1)
+    known = np.isfinite(exact) & np.isfinite(rough)
+    return np.where(known, exact - np.where(known, rough, 0.0), 0.0)
 
 
 def inverse(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
