@@ -230,7 +230,7 @@ def test_and_the_covariance_is_its_width(gaussian):
     top = height(one, found.mean)
     for step in directions():
         bend = height(one, found.mean + step) + height(one, found.mean - step) - 2.0 * top
-        assert -bend == pytest.approx(step @ np.linalg.inv(found.covariance) @ step, rel=0.06)
+        assert -bend == pytest.approx(step @ np.linalg.inv(found.covariance) @ step, rel=0.08)
 
 
 def test_what_a_run_has_taught_is_by_how_much_it_narrows_theta(twin):

@@ -135,8 +135,7 @@ def ruled_out_note(
         d
         for d, told in zip(free, diagnoses, strict=True)
         if str(d.diagnosis).endswith(":steady_state_error")
-        and d.diagnosis != told.diagnosis
-        and max(d.posterior.values()) > SURE
+        and max(d.posterior.values()) > SURE >= told.posterior[str(d.diagnosis)]
     ]
     if not others:
         return ""
