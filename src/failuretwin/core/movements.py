@@ -15,7 +15,7 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.polyline import REST_S, TURN_RAD, simplify
-from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray
+from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray, IntArray
 
 ROUNDING_RAD = 2e-3
 """Tolerance of the straight lines that replace logged references [rad], a tenth of a degree: half a
@@ -106,6 +106,35 @@ class Movements(ArrayStruct):
             times[:, knot] = last = np.where(missing, last, times[:, knot])
             values[:, knot] = held = np.where(missing, held, values[:, knot])
         return times, values
+
+
+@dataclass(frozen=True)
+class Stretches(Movements):
+    """Movements up to one reading each, at rest or on the way.
+
+    Attributes:
+        beginning: Reference at the start of each, (run, movement, motor) [rad].
+        speed: Of the reference at the reading, (run, movement, motor) [rad/s]; 0 at rest.
+        bend: What a lag leaves of an acceleration there, (run, movement, motor) [rad].
+        done: Share of the movement that each motor had made, (run, movement, motor).
+        at_rest: Whether the reading is at rest, (run, movement).
+        whole: Whether a stretch is all that is seen of its movement, (run, movement).
+        curved: Whether its movement is a curve, not straight ramps, (run, movement).
+        movement: Index of its movement, (run, movement).
+    """
+
+    beginning: Annotated[FloatArray, Axes("run", "movement", "motor", empty=np.nan)]
+    speed: Annotated[FloatArray, Axes("run", "movement", "motor")]
+    bend: Annotated[FloatArray, Axes("run", "movement", "motor")]
+    done: Annotated[FloatArray, Axes("run", "movement", "motor", empty=1.0)]
+    at_rest: Annotated[BoolArray, Axes("run", "movement", empty=True)]
+    whole: Annotated[BoolArray, Axes("run", "movement", empty=True)]
+    curved: Annotated[BoolArray, Axes("run", "movement", empty=False)]
+    movement: Annotated[IntArray, Axes("run", "movement", empty=0)]
+
+    def origin(self) -> FloatArray:
+        """Return the reference at the start of each stretch, (run, movement, motor) [rad]."""
+        return self.beginning
 
 
 def stack_movements(parts: Sequence[Movements]) -> Movements:

@@ -31,6 +31,7 @@ from failuretwin.inference.explanation import worded
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.observation.evidence import TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.on_the_way import beside
 from failuretwin.inference.observation.sensors import SensorStack, parse_sensing, sensing_of
 from failuretwin.inference.posterior import (
     check_diagnosable,
@@ -164,7 +165,7 @@ class BayesDiagnoser:
         names, faults = [str(name) for name in runs["run"].values], truth_of(runs)
         truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
         results, quality = [], seen[0].evidence.quality
-        chunk = _runs_at_a_time(seen[0].evidence.settled.movements.start.shape[1])
+        chunk = _runs_at_a_time(seen[0].settled.movements.start.shape[1])
         for first in range(0, len(names), chunk):
             rows = slice(first, first + chunk)
             says = [one.posterior(rows, way) for one, way in zip(seen, moving, strict=True)]
@@ -193,8 +194,8 @@ class BayesDiagnoser:
         """Return the readings on the way that count; None: none do."""
         if not self.uses_transients:
             return None
-        sound = seen.evidence.sound
-        return sound.transient.where(self.transient_mask(sound.settled.usable, seen.model.sensors))
+        moving = beside(seen.evidence.sound.transient, seen.settled)
+        return moving.where(self.transient_mask(seen.settled.usable, seen.model.sensors))
 
     def _check_shown(self, model: HealthyModel) -> None:
         """Refuse faults that say that a sensor which is believed is wrong."""

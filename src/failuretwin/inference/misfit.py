@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from failuretwin.core.movements import Stretches
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.posterior import Posterior
@@ -33,7 +34,10 @@ def highest_and_outlier(likelihood: RunLikelihood) -> tuple[FloatArray, FloatArr
     """
     model, evidence = likelihood.model, likelihood.evidence
     healthy = likelihood.findings.expected[:, :, 0]
-    _, _, spread = model.residual(evidence.point, healthy, model.scatter)
+    scatter = model.scatter
+    if isinstance(evidence.movements, Stretches):
+        scatter = model.scatter_at(evidence.movements)
+    _, _, spread = model.residual(evidence.point, healthy, scatter)
     highest = np.where(likelihood.usable, spread.log_norm(model.settling.tail_dof), 0.0)
     return highest, np.where(likelihood.usable, model.outlier_log_density, 0.0)
 

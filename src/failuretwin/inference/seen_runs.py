@@ -22,8 +22,9 @@ from failuretwin.inference.engine.weighing import ALLOWED_FOR
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import FITS, run_misfit
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
-from failuretwin.inference.observation.evidence import Evidence, TransientSamples
+from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.on_the_way import on_the_way
 from failuretwin.inference.observation.rounding import (
     Rounding,
     command_rounding,
@@ -84,6 +85,11 @@ class SeenRuns:
         return Evidence(self.runs, self.model.settings, self.model.sensors)
 
     @cached_property
+    def settled(self) -> SettledEvidence:
+        """Where the tool settled after each movement, or was on its way."""
+        return on_the_way(self.evidence.sound, self.model)
+
+    @cached_property
     def healthy(self) -> HealthyModel:
         """The healthy robot as these runs show it, with what was rounded off as noise."""
         return rounded(self.model, self.tool_rounding, None)
@@ -119,10 +125,9 @@ class SeenRuns:
     @cached_property
     def sample(self) -> RunLikelihood:
         """Some of the runs by their settled positions."""
-        settled = self.evidence.sound.settled
-        count = len(settled.usable)
+        count = len(self.settled.usable)
         some = np.unique(np.linspace(0, count - 1, JUDGED_RUNS).astype(np.int64))
-        return RunLikelihood(settled[some], self.healthy)
+        return RunLikelihood(self.settled[some], self.healthy)
 
     @cached_property
     def in_doubt(self) -> bool:
@@ -185,7 +190,7 @@ class SeenRuns:
             moving: Readings on the way of all runs; None: they are left aside.
         """
         way = None if moving is None else moving[rows]
-        likelihood = RunLikelihood(self.evidence.sound.settled[rows], self.healthy, way)
+        likelihood = RunLikelihood(self.settled[rows], self.healthy, way)
         return shared_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt)
 
     def robots(self, named: Posterior, common: Sequence[str], others: bool) -> RobotMixture:

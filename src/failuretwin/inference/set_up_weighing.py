@@ -21,12 +21,12 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
-from failuretwin.inference.engine.registration import displaced_evidence
+from failuretwin.inference.engine.registration import displaced_evidence, evidence_at_once
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import highest_and_outlier
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
-from failuretwin.inference.posterior import log_prior, marginal_likelihoods
+from failuretwin.inference.posterior import log_prior
 from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp, with_doubt
 from failuretwin.inference.set_ups.log_correction import LogCorrection
 from failuretwin.inference.set_ups.set_ups import FEWEST_TO_TURN, SetUp, mistakes, turned, zero_off
@@ -130,9 +130,8 @@ class SetUpWeighing:
         for first in range(0, len(set_ups), at_a_time):
             some = set_ups[first : first + at_a_time]
             likelihood = self.behind(some)
-            says = marginal_likelihoods(likelihood, hypotheses, self.priors)
-            log_joint = np.stack([one.log_evidence for one in says], axis=1) + log_odds
-            found += _weighed(some, likelihood, log_sum(log_joint, axis=1))
+            says = evidence_at_once(likelihood, hypotheses, self.priors)
+            found += _weighed(some, likelihood, log_sum(says + log_odds, axis=1))
         return found
 
     def weigh_moved(self, set_up: SetUp) -> WeighedSetUp:

@@ -171,9 +171,13 @@ class _Motor:
         direction = np.broadcast_to(moments.direction[:, None], base.shape)
         held = (np.arange(base.shape[-1]) == motor) & self.held
         pose = scene.model.settle(base, direction, held)
-        spread = np.swapaxes(pose, 1, 2)
-        outcomes = Outcomes.of_poses(scene.model, moments, spread, self.variance)
-        G = columns(scene.model, pose, direction, scene.layout)
+        speed, late = (
+            np.broadcast_to(np.where(held, 0.0, values[:, None]), pose.shape)
+            for values in (moments.speed, moments.late)
+        )
+        spread, beside = np.swapaxes(pose, 1, 2), np.swapaxes(late, 1, 2)
+        outcomes = Outcomes.of_poses(scene.model, moments, spread, self.variance, beside)
+        G = columns(scene.model, pose, direction, speed, scene.layout)
         jacobian = scene.model.sensors.expected(pose[:, :, :, 0])[1]
         if self.held:
             G[..., scene.layout.own(motor)] = 0.0
@@ -203,8 +207,8 @@ def held_rows(scene: Scene, motor: int) -> Rows:
     count, scatter = moments.count, max(float(scene.model.scatter[motor]), 1e-4)
     low, high = held_range(scene, motor)
     goal = scene.settled[..., motor]
-    off = scene.settled[:, :1, motor] - moments.base[:, :1, 0, motor]
-    was = np.concatenate([moments.origin[:, :1, motor] + off, goal[:, :-1]], axis=1)
+    off = goal - moments.base[:, :, 0, motor]
+    was = moments.origin[..., motor] + np.concatenate([off[:, :1], off[:, :-1]], axis=1)
     intervals = stuck_intervals(scene, motor)
     known, share = priors.onset.known_s, priors.onset.free
     weight = intervals.weights(priors.onset.before_run("stuck"))

@@ -4,7 +4,8 @@ Rows of hypotheses carry the normal distribution of f = G theta + H z over all t
 
     f ~ N(G mu, K),    K = G V G^T + var(z) H H^T
 
-A moment m replaces its likelihood by a normal factor of f_m with information W and shift
+Moments of one movement share its outcome: what one says of it is the weight with which the next
+begins. A moment m replaces its likelihood by a normal factor of f_m with information W and shift
 b = W f_m + alpha (assumed-density filter). Given all factors,
 
     a = (I + W K)^-1 (b - W G mu),    theta | row: mu + V G^T a,  V - V G^T (I + W K)^-1 W G V
@@ -15,10 +16,11 @@ Section: docs/inference.md#filter
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.engine.integral import (
     Mixture,
@@ -35,6 +37,7 @@ class FilterRows:
     Attributes:
         mixture_at: The outcomes of a moment under each row.
         usable: Moments with readings, (row, moment).
+        kept: Probability that the outcome of the moment before holds on, (row, moment).
         mean: G mu, (row, moment, channel) [m].
         covariance: G V G^T, (row, moment * channel, moment * channel) [m2].
         lever: H, (row, moment, channel).
@@ -44,6 +47,7 @@ class FilterRows:
 
     mixture_at: Callable[[int], Mixture]
     usable: BoolArray
+    kept: FloatArray
     mean: FloatArray
     covariance: FloatArray
     lever: FloatArray
@@ -78,6 +82,7 @@ class RowsPosterior:
         information: W, (row, moment, channel, channel).
         shift: b, (row, moment, channel).
         share: Share of each outcome when its moment came, (row, moment, outcome).
+        log_weight: Log of its weight before that, (row, moment, outcome).
         mean: Mean of f given all moments, (row, moment, channel) [m].
         amount: Mean and variance of z given all moments, (row, 2).
     """
@@ -86,6 +91,7 @@ class RowsPosterior:
     information: FloatArray
     shift: FloatArray
     share: FloatArray
+    log_weight: FloatArray
     mean: FloatArray
     amount: FloatArray
 
@@ -120,9 +126,13 @@ def filter_rows(rows: FilterRows) -> RowsPosterior:
     f, whole = rows.prior
     log_evidence = np.zeros((count, moments))
     information = np.zeros((count, moments, channels, channels))
-    shift, shares = np.zeros((count, moments, channels)), []
+    shift, shares, weights = np.zeros((count, moments, channels)), [], []
     for m in range(moments):
         mixture = rows.mixture_at(m)
+        if rows.kept[:, m].any():
+            carried = _carried(mixture.log_weight, shares[-1], weights[-1], rows.kept[:, m])
+            mixture = replace(mixture, log_weight=carried)
+        weights.append(mixture.log_weight)
         share = np.zeros(mixture.log_weight.shape)
         some = np.flatnonzero(usable[:, m])
         if len(some):
@@ -136,15 +146,41 @@ def filter_rows(rows: FilterRows) -> RowsPosterior:
             W = information[some, m]
             taken = np.linalg.solve(np.eye(channels) + W @ spread, W)
             whole[some] -= np.matmul(np.matmul(cross, taken), np.swapaxes(cross, -1, -2))
+        if m:  # a moment that was not seen leaves what was known of its movement
+            unseen = (rows.kept[:, m] > 0.0) & ~usable[:, m]
+            share = np.where(unseen[:, None], shares[-1], share)
         shares.append(share)
     return RowsPosterior(
         log_evidence,
         information,
         shift,
         np.stack(shares, axis=1),
+        np.stack(weights, axis=1),
         f[:, :size].reshape(count, moments, channels),
         np.stack([f[:, size], whole[:, size, size]], axis=1),
     )
+
+
+def _carried(
+    log_weight: FloatArray, share: FloatArray, before: FloatArray, kept: FloatArray
+) -> FloatArray:
+    """Return the log weights of outcomes given what the moment before said of them, same axes.
+
+    What an outlier leaves open is as it was before.
+
+    Args:
+        log_weight: Weights that nothing is known of, (row, outcome).
+        share: Share of each when the moment before came, (row, outcome).
+        before: Log of its weight then, (row, outcome).
+        kept: Probability that it holds on, (row,).
+    """
+    found = log_weight.copy()
+    some = np.flatnonzero((kept > 0.0) & np.isfinite(before).any(axis=1))
+    total, stays = log_sum(log_weight[some], axis=1)[:, None], kept[some, None]
+    usual = np.exp(before[some] - log_sum(before[some], axis=1)[:, None])
+    known = share[some] + np.maximum(1.0 - share[some].sum(axis=1), 0.0)[:, None] * usual
+    found[some] = log_of(stays * known + (1.0 - stays) * np.exp(log_weight[some] - total)) + total
+    return found
 
 
 def site(
@@ -193,7 +229,8 @@ def refine(rows: FilterRows, found: RowsPosterior) -> RowsPosterior:
         if not len(some):
             continue
         here, spread = sites.without(m, some)
-        says = moment_posterior(rows.mixture_at(m)[some], here, spread, rows.noise)
+        mixture = replace(rows.mixture_at(m)[some], log_weight=found.log_weight[some, m])
+        says = moment_posterior(mixture, here, spread, rows.noise)
         W, b = site(says, here, spread)
         log_evidence[some, m] = says.log_evidence - _log_integral(W, b, here, spread)
         shares[some, m] = says.share
@@ -206,6 +243,7 @@ def refine(rows: FilterRows, found: RowsPosterior) -> RowsPosterior:
         np.where(agree[:, None, None, None], sites.information, found.information),
         np.where(agree[:, None, None], sites.shift, found.shift),
         np.where(agree[:, None, None], shares, found.share),
+        found.log_weight,
         np.where(agree[:, None, None], f, found.mean),
         np.where(agree[:, None], z, found.amount),
     )

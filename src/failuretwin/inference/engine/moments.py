@@ -1,21 +1,28 @@
-"""Moments: what the sensors say at one time of a run, the settled point after each movement.
+"""Moments: what the sensors say at one time of a run, at rest after a movement or on its way.
 
-A movement without one has a moment that is not usable.
+A movement that was not seen has a moment that is not usable.
 
 Section: docs/inference.md#moments
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from failuretwin.core.movements import Stretches
+from failuretwin.core.numerics import log_of
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.observation.command_loss import CommandOutcomes
 from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
+LATE_RATE = 0.02
+"""Least probability that an arm on whose way it is looked has not set out yet: a bus that stalls, a
+controller that thinks; assumed."""
+KEPT_ON_CURVES = 0.7
+"""Probability that an error on a curve stays what it is until the next moment; assumed."""
 MOST_OUTCOMES = 12
 """Outcomes of a movement that are weighed: the most probable ones."""
 
@@ -37,6 +44,11 @@ class Moments:
         lost: Motors that miss their command, same axes.
         log_weight: Log probability of each outcome, (run, moment, outcome).
         outcome: Index of each among all outcomes of the movement, (run, moment, outcome).
+        speed: Of each motor, (run, moment, outcome, motor) [rad/s]; 0 at rest.
+        late: Variance of each motor along its motion, same axes [rad2]; 0 at rest.
+        done: Share of the movement that each motor had made, (run, moment, motor).
+        kept: Probability that what became of the moment before holds on, (run, moment): 1 in one
+            ramp, 0 with a new movement.
     """
 
     point: FloatArray
@@ -51,6 +63,10 @@ class Moments:
     lost: BoolArray
     log_weight: FloatArray
     outcome: IntArray
+    speed: FloatArray
+    late: FloatArray
+    done: FloatArray
+    kept: FloatArray
 
     @property
     def runs(self) -> int:
@@ -64,7 +80,7 @@ class Moments:
 
 
 def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
-    """Return the moments of some runs: the rest after each movement.
+    """Return the moments of some runs.
 
     Args:
         model: The healthy robot.
@@ -77,7 +93,8 @@ def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
     target, origin = np.nan_to_num(movements.target), np.nan_to_num(movements.origin())
     chosen, kept = _likeliest(outcomes)
     base, direction, weight = kept
-    return Moments(
+    lost = outcomes.lost[chosen]
+    found = Moments(
         point=evidence.point,
         usable=evidence.usable,
         target=target,
@@ -87,9 +104,61 @@ def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
         time=np.nan_to_num(0.5 * (evidence.begin + evidence.end)),
         base=base,
         direction=direction,
-        lost=outcomes.lost[chosen],
+        lost=lost,
         log_weight=weight,
         outcome=chosen,
+        speed=np.zeros_like(base),
+        late=np.zeros_like(base),
+        done=np.ones_like(target),
+        kept=np.zeros(target.shape[:2]),
+    )
+    if isinstance(movements, Stretches):
+        late = model.late(movements, evidence.first_reading_delay)
+        return _on_the_way(found, movements, late, model.start_jitter_s)
+    return found
+
+
+def _on_the_way(
+    moments: Moments, stretches: Stretches, late: FloatArray, jitter_s: float
+) -> Moments:
+    """Return moments of which some are on the way.
+
+    Where a stretch is all that is seen of a movement, its motors may have missed the command, or
+    may not have set out yet, all of them.
+
+    Args:
+        moments: As if all were at rest.
+        stretches: The movements.
+        late: Probability that each started late, (run, movement).
+        jitter_s: Deviation of when a motor starts [s].
+    """
+    way = ~stretches.at_rest & stretches.exists
+    whole = stretches.whole | stretches.at_rest
+    never = ~whole[..., None] & moments.lost.any(axis=-1)
+    weight = np.where(never, -np.inf, moments.log_weight)
+    late = np.where(way & whole, np.maximum(late, LATE_RATE), 0.0)
+    waits = weight[..., :1] + log_of(late)[..., None]
+    weight = np.concatenate([weight + log_of(1.0 - late)[..., None], waits], axis=-1)
+    speed = np.where(moments.lost, 0.0, stretches.speed[:, :, None])
+    bend = np.where(moments.lost, 0.0, stretches.bend[:, :, None])
+    kept, same = np.zeros(way.shape), way[:, 1:]
+    same = same & (stretches.movement[:, 1:] == stretches.movement[:, :-1])
+    kept[:, 1:] = np.where(same, np.where(stretches.curved[:, 1:], KEPT_ON_CURVES, 1.0), 0.0)
+
+    def with_waiting(values: FloatArray, waiting: FloatArray) -> FloatArray:
+        return np.concatenate([values, waiting[:, :, None]], axis=2)
+
+    return replace(
+        moments,
+        base=with_waiting(moments.base, moments.origin),
+        direction=with_waiting(moments.direction, moments.direction[:, :, 0]),
+        lost=with_waiting(moments.lost, np.ones_like(moments.lost[:, :, 0])),
+        log_weight=weight,
+        outcome=np.concatenate([moments.outcome, np.zeros_like(moments.outcome[..., :1])], axis=-1),
+        speed=with_waiting(speed, np.zeros_like(moments.origin)),
+        late=with_waiting((speed * jitter_s) ** 2 + bend**2, np.zeros_like(moments.origin)),
+        done=stretches.done,
+        kept=kept,
     )
 
 

@@ -40,7 +40,7 @@ class Outcomes:
         moments: Moments,
         pose: FloatArray,
         variance: FloatArray,
-        beside: FloatArray | None = None,
+        beside: FloatArray,
     ) -> Outcomes:
         """Return the outcomes of some poses.
 
@@ -49,7 +49,7 @@ class Outcomes:
             moments: The moments.
             pose: Settled angles, (run, moment, ..., motor) [rad].
             variance: Of the scatter of each motor, (..., motor) [rad2].
-            beside: Variance of single motors beside it, (..., motor) [rad2]; None: none.
+            beside: Variance of single motors beside it, same axes as `pose` [rad2].
         """
         expected, jacobian = model.sensors.expected(pose)
         point = moments.point
@@ -58,7 +58,7 @@ class Outcomes:
         transposed = np.swapaxes(jacobian, -1, -2)
         scatter = np.matmul(jacobian * np.asarray(variance)[..., None, :], transposed)
         extra = np.broadcast_to(0.0, scatter.shape)
-        if beside is not None:
+        if beside.any():
             extra = np.matmul(jacobian * beside[..., None, :], transposed)
         return cls(point - expected, scatter, extra)
 

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.engine.filter import FilterRows
 from failuretwin.inference.engine.integral import Mixture
 from failuretwin.inference.engine.rows import Rows, Scene
@@ -155,10 +155,13 @@ class Narrowed:
     log_weight: FloatArray
 
 
-def narrowed(rows: Rows, picks: Picks, share: FloatArray, components: Components) -> Narrowed:
+def narrowed(
+    scene: Scene, rows: Rows, picks: Picks, share: FloatArray, components: Components
+) -> Narrowed:
     """Return the outcomes of some rows that count.
 
     Args:
+        scene: The runs.
         rows: Rows of the hypothesis.
         picks: Those that are kept.
         share: Share of each outcome, (pick, moment, outcome).
@@ -167,6 +170,7 @@ def narrowed(rows: Rows, picks: Picks, share: FloatArray, components: Components
     run, row = picks.run, picks.row
     place = np.full(rows.log_prior.shape, -1)
     place[run, row] = np.arange(len(run))
+    share = _of_movements(share, _kept(scene, rows, picks) > 0.0)
     order = np.argsort(-share, axis=-1, kind="stable")
     left = 1.0 - np.cumsum(np.take_along_axis(share, order, axis=-1), axis=-1)
     total = share.sum(axis=-1, keepdims=True)
@@ -194,6 +198,30 @@ def narrowed(rows: Rows, picks: Picks, share: FloatArray, components: Components
         rows.outcomes.beside[index],
         np.where(own_count, log_weight, -np.inf),
     )
+
+
+def _kept(scene: Scene, rows: Rows, picks: Picks) -> FloatArray:
+    """Return how probable it is that the outcome of the moment before holds on, (pick, moment).
+
+    A fault that begins in the middle of a movement makes another of it.
+    """
+    begins = np.arange(scene.moments.count) == rows.first[picks.row][:, None]
+    return np.where(begins, 0.0, scene.moments.kept[picks.run])
+
+
+def _of_movements(share: FloatArray, same: BoolArray) -> FloatArray:
+    """Return shares (pick, moment, outcome) that are alike in all moments of one movement.
+
+    An outcome counts as in the moment that it explains best.
+    """
+    if not same.any():
+        return share
+    found = share.copy()
+    for m in range(1, share.shape[1]):
+        found[same[:, m], m] = np.maximum(found[same[:, m], m], found[same[:, m], m - 1])
+    for m in range(share.shape[1] - 1, 0, -1):
+        found[same[:, m], m - 1] = found[same[:, m], m]
+    return found / np.maximum(found.sum(axis=-1, keepdims=True), 1.0)
 
 
 def _stacked(pairs: Sequence[tuple[FloatArray, ...]]) -> tuple[FloatArray, FloatArray]:
@@ -258,6 +286,7 @@ def _ready(
     return FilterRows(
         mixture_at,
         scene.moments.usable[picks.run],
+        _kept(scene, rows, picks),
         *f,
         rows.lever[picks.run, picks.row],
         rows.variance[picks.run, picks.row],

@@ -80,18 +80,18 @@ def _nodes(scene: Scene, motor: int, size: FloatArray, width: FloatArray) -> Out
     """Return the outcomes of all nodes if the commands of all motors arrive."""
     moments, model = scene.moments, scene.model
     base = np.repeat(moments.base[:, :, :1], len(size), axis=2)
-    base[..., motor] += size
+    base[..., motor] += size * moments.done[:, :, None, motor]
     direction = np.broadcast_to(moments.direction[:, :, :1], base.shape)
-    beside = np.zeros((len(size), base.shape[-1]))
-    beside[:, motor] = width**2 / 12.0
+    beside = np.repeat(moments.late[:, :, :1], len(size), axis=2)
+    beside[..., motor] += width**2 / 12.0
     pose = model.settle(base, direction, model.none_held)
     return Outcomes.of_poses(model, moments, pose, model.scatter**2, beside)
 
 
 def _beside_losses(scene: Scene, motor: int, mean_square: float) -> Outcomes:
     """Return the outcomes in which commands get lost, with the error as normal."""
-    beside = np.zeros(scene.pose.shape[-1])
-    beside[motor] = mean_square
+    beside = scene.moments.late[:, :, 1:].copy()
+    beside[..., motor] += mean_square
     pose, variance = scene.pose[:, :, 1:], scene.model.scatter**2
     return Outcomes.of_poses(scene.model, scene.moments, pose, variance, beside)
 

@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.movements import Stretches
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import GENERIC_NAME
 from failuretwin.inference.engine.posterior import misfit_of, theta_factors
@@ -32,7 +33,7 @@ from failuretwin.inference.engine.weighing import Weighing, assembled
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.posterior import Posterior, compute_posterior
+from failuretwin.inference.posterior import Posterior, compute_posterior, marginal_likelihoods
 from failuretwin.inference.set_ups.setup_prior import SetupPrior
 from failuretwin.inference.theta.shared_unknowns import layout_of as offsets_in_doubt
 
@@ -53,7 +54,7 @@ def robot_weighing(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> Weighing:
     """Return runs of a robot whose sensor is where the profile says."""
-    layout, components = _usual(likelihood.model)
+    layout, components = _usual(likelihood)
     place = np.zeros((len(likelihood.usable), REGISTRATION))
     return Weighing(likelihood, hypotheses, priors, layout, components, place)
 
@@ -62,7 +63,7 @@ def displaced_weighing(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors, place: FloatArray
 ) -> Weighing:
     """Return runs of a robot whose sensor may be displaced, each about a registration (run, 7)."""
-    layout, usual = _usual(likelihood.model)
+    layout, usual = _usual(likelihood)
     components = displaced_components(likelihood.model, priors.setup, layout, usual)
     components = components.about(np.pad(place, ((0, 0), (0, layout.size - REGISTRATION))))
     if place.any():  # rows are chosen by a sensor that stands right there
@@ -71,8 +72,9 @@ def displaced_weighing(
     return Weighing(likelihood, hypotheses, priors, layout, components, place)
 
 
-def _usual(model: HealthyModel) -> tuple[Layout, Components]:
-    layout = layout_of(model.without_doubt)
+def _usual(likelihood: RunLikelihood) -> tuple[Layout, Components]:
+    model = likelihood.model
+    layout = layout_of(model.without_doubt, isinstance(likelihood.evidence.movements, Stretches))
     factors = model.imperfections.name == GENERIC_NAME and model.scatter_factor == 1.0
     return layout, robot_components(model, layout, factors)
 
@@ -122,7 +124,7 @@ def _about(
 ) -> Weighing:
     """Return runs about some registrations, with a broad prior of it and extra noise."""
     model = likelihood.model
-    layout, usual = _usual(model)
+    layout, usual = _usual(likelihood)
     frames = displaced_components(model, priors.setup, layout, usual)
     noise = float(np.hypot(model.path_noise, share * model.twin.robot.reach))
     ranked = [h for h in hypotheses if has_rows(h)]
@@ -191,7 +193,7 @@ def _suspect(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors, best: IntArray
 ) -> bool:
     """Return whether the sensor may be displaced, by the most probable hypothesis of each run."""
-    layout, usual = _usual(likelihood.model)
+    layout, usual = _usual(likelihood)
     size, narrow = layout.size, usual.first
     information, shift = np.zeros((len(best), size, size)), np.zeros((len(best), size))
     ill: BoolArray = np.zeros(len(best), dtype=bool)
@@ -236,6 +238,17 @@ def robot_evidence(
     """Return log p(run | h) of runs whose sensor is where the profile says, (run, hypothesis)."""
     parts = _robot_parts(likelihood, hypotheses, priors)
     return np.concatenate([one.by_hypothesis for one in parts])
+
+
+def evidence_at_once(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> FloatArray:
+    """Return log p(run | h), theta as told where every reading is at rest, (run, hypothesis)."""
+    ranked = any(has_rows(h) for h in hypotheses)
+    if ranked and isinstance(likelihood.evidence.movements, Stretches):
+        return robot_evidence(likelihood, hypotheses, priors)
+    says = marginal_likelihoods(likelihood, hypotheses, priors)
+    return np.stack([one.log_evidence for one in says], axis=1)
 
 
 def _robot_parts(

@@ -106,10 +106,10 @@ class Scene:
         """
         noise = Noise(model.settling.tail_dof, model.sensors.dims, model.outlier_log_density)
         pose = model.settle(moments.base, moments.direction, model.none_held)
-        G = columns(model, pose, moments.direction, layout)
+        G = columns(model, pose, moments.direction, moments.speed, layout)
         usual = G[:, :, 0]
         spread = usual @ covariance @ np.swapaxes(usual, -1, -2)
-        healthy = Outcomes.of_poses(model, moments, pose, model.scatter**2)
+        healthy = Outcomes.of_poses(model, moments, pose, model.scatter**2, moments.late)
         return cls(model, moments, priors, noise, layout, G, spread, pose, healthy)
 
     @property

@@ -236,7 +236,8 @@ class RunsEvidence:
         table[one.picks.run, one.picks.row] = one.log_evidence
         near = table > table.max(axis=1, keepdims=True) - ROWS_NATS
         some = np.flatnonzero(near[one.picks.run, one.picks.row])
-        return narrowed(self.rows[h], one.picks[some], one.found.share[some], self.components)
+        share = one.found.share[some]
+        return narrowed(self.scene, self.rows[h], one.picks[some], share, self.components)
 
     def _near_best(self, h: int, one: Weighed) -> Picks:
         """Return the rows of a hypothesis that come near its best, in each run."""

@@ -1,10 +1,11 @@
 """Theta: what all moments of a robot share and nobody knows exactly.
 
-    f = G theta,    G = [ I | -[x]x | x | J | J diag(g) | -J diag(d) | dx/dgeometry ]
+    f = G theta,    G = [ I | -[x]x | x | J | J diag(g) | -J diag(d) | dx/dgeometry | -J diag(qd) ]
 
 with origin t [m], turn w [rad] and scale k [-] of the tool sensor's frame, bias b [rad], compliance
-c [rad/(N m)] and friction f [rad] of each motor, and the frames of the joints, each moved [m] and
-turned [rad]. The prior is a mixture of normal distributions.
+c [rad/(N m)] and friction f [rad] of each motor, the frames of the joints, each moved [m] and
+turned [rad], and, of robots that are seen on the way, the lag of each motor [s] beside the mean one
+of the robot. The prior is a mixture of normal distributions.
 
 Section: docs/inference.md#theta
 """
@@ -41,10 +42,12 @@ class Layout:
     Attributes:
         motors: Number of motors.
         geometry: Whether the frames of the joints are unknown.
+        moving: Whether moments on the way tell of lags.
     """
 
     motors: int
     geometry: bool
+    moving: bool = False
 
     @property
     def offsets(self) -> slice:
@@ -57,9 +60,14 @@ class Layout:
         return slice(self.offsets.stop, self.offsets.stop + 6 * self.motors * self.geometry)
 
     @property
+    def lags(self) -> slice:
+        """Places of the lags."""
+        return slice(self.frames.stop, self.frames.stop + self.motors * self.moving)
+
+    @property
     def size(self) -> int:
         """Length of theta."""
-        return self.frames.stop
+        return self.lags.stop
 
     def own(self, motor: int) -> list[int]:
         """Return the places of one motor's bias, compliance and friction."""
@@ -172,6 +180,7 @@ def columns(
     model: HealthyModel,
     pose: FloatArray,
     direction: FloatArray,
+    speed: FloatArray,
     layout: Layout,
 ) -> FloatArray:
     """Return G at some poses, (..., channel, theta).
@@ -180,6 +189,7 @@ def columns(
         model: The healthy robot.
         pose: Settled angles, (..., motor) [rad].
         direction: Sign of the last travel, (..., motor).
+        speed: (..., motor) [rad/s].
         layout: Places in theta.
     """
     value, jacobian = model.sensors.expected(pose)
@@ -194,6 +204,8 @@ def columns(
     parts = [rigid, jacobian, jacobian * load, -jacobian * direction[..., None, :]]
     if layout.geometry:
         parts.append(model.twin.geometry_columns(pose))
+    if layout.moving:
+        parts.append(-jacobian * speed[..., None, :])
     return np.concatenate(parts, axis=-1)
 
 
@@ -202,9 +214,14 @@ def has_geometry(model: HealthyModel) -> bool:
     return model.sensors.tool_alone and model.twin.robot.profile.sensor_pose != "log"
 
 
-def layout_of(model: HealthyModel) -> Layout:
-    """Return what is unknown of a robot."""
-    return Layout(len(model.scatter), has_geometry(model))
+def layout_of(model: HealthyModel, moving: bool = False) -> Layout:
+    """Return what is unknown of a robot.
+
+    Args:
+        model: The healthy robot.
+        moving: Whether it is seen on the way.
+    """
+    return Layout(len(model.scatter), has_geometry(model), moving)
 
 
 SCATTER = {0.5: 0.25, 1.0: 0.4, 2.0: 0.2, 4.0: 0.1, 9.0: 0.05}
@@ -258,7 +275,11 @@ def _covariance(model: HealthyModel, layout: Layout, factor: float) -> FloatArra
     deviation[layout.offsets] = np.maximum(factor * offset_deviation(model), least)
     if layout.geometry:
         deviation[layout.frames] = factor * frame_deviation(model.twin.robot)
-    return np.diag(deviation**2)
+    covariance = np.diag(deviation**2)
+    if layout.moving:
+        common, own = model.lag_deviations_s
+        covariance[layout.lags, layout.lags] = common**2 + own**2 * np.eye(motors)
+    return covariance
 
 
 def frame_deviation(robot: Robot) -> FloatArray:

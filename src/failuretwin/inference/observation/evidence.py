@@ -120,9 +120,7 @@ class Evidence:
         true rate of the sensor says; samples on lines drawn between readings do not count.
         """
         time, settled, readings = as_floats(self.runs["time"].values), self.settled, self.readings
-        read, least_step = readings.seen.copy(), 0.9 / measured_rate(self.runs)
-        for run in np.flatnonzero(readings.filled):
-            read[run] &= _corners(readings.point[run], grid_steps(self.runs))
+        read, least_step = self.read, 0.9 / measured_rate(self.runs)
         start, until = settled.movements.start, settled.transient_until
         points = self.sensors.read_on_way(self.runs, readings) if self.sensors else readings.point
         found = TransientSamples.empty(
@@ -137,6 +135,14 @@ class Evidence:
             item, point = (run, movement), points[run, rows]
             found.take_in(item, start[item], time[rows], point, least_step)
         return found
+
+    @cached_property
+    def read(self) -> BoolArray:
+        """Where there is a reading, lines drawn between readings aside, (run, time)."""
+        read = self.readings.seen.copy()
+        for run in np.flatnonzero(self.readings.filled):
+            read[run] &= _corners(self.readings.point[run], grid_steps(self.runs))
+        return read
 
     @property
     def _moving_spread_m(self) -> float:

@@ -16,7 +16,7 @@ from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.movements import Movements
+from failuretwin.core.movements import Movements, Stretches
 from failuretwin.core.numerics import Covariance, log_sum
 from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
@@ -32,7 +32,7 @@ from failuretwin.inference.observation.command_loss import (
 from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.sensors import TOOL_ALONE, SensorStack
 from failuretwin.inference.observation.settings import InferenceSettings
-from failuretwin.inference.observation.start_delay import StartDelay
+from failuretwin.inference.observation.start_delay import PUNCTUAL_SPREAD_S, StartDelay
 
 PATH_NOISE_M = 0.001
 """Noise assumed of a settled tool position where the sensor is not known [m]."""
@@ -43,6 +43,11 @@ reach: links that differ from the drawing, and the sensor. Of two industrial arm
 HELD_PLAY_RAD = 0.003
 """What the gear of a held motor gives by under changing loads, 0.17 deg: it is not held better than
 its healthy neighbours scatter, however exact these are; assumed."""
+UNKNOWN_JITTER_S = 0.03
+"""Deviation of when a motor starts about its lag, where nobody has measured it [s]; assumed."""
+LAG_S, KNOWN_LAG_S = (0.03, 0.02), (0.015, 0.015)
+"""Deviations of the lag of all motors together, with the clock, and of each of them, of a robot
+whose timing nobody has measured and of one that is calibrated [s]; assumed."""
 LEAST_VISIBLE_POSES = 200
 """Poses at which it is asked how small an angle shows."""
 
@@ -231,6 +236,25 @@ class HealthyModel:
         loops = [1.0 / motor.loop.I for motor in self.twin.robot.motors]
         return float(np.mean(loops) + np.mean(timing.delay_s) + np.mean(timing.lag_s))
 
+    @property
+    def start_jitter_s(self) -> float:
+        """Deviation of when a motor starts about its own lag [s]."""
+        return PUNCTUAL_SPREAD_S if self.knows_timing else UNKNOWN_JITTER_S
+
+    @property
+    def lag_deviations_s(self) -> tuple[float, float]:
+        """Deviations of the lag of all motors together, with the clock, and of each [s]."""
+        return KNOWN_LAG_S if self.knows_timing else LAG_S
+
+    def scatter_at(self, stretches: Stretches) -> FloatArray:
+        """Return the scale of each motor's scatter on the way, its lag unknown, (..., motor) [rad].
+
+        Args:
+            stretches: The movements.
+        """
+        late = np.hypot(self.start_jitter_s, np.hypot(*self.lag_deviations_s))
+        return np.hypot(np.hypot(self.scatter, late * stretches.speed), stretches.bend)
+
     @cached_property
     def start_delay(self) -> StartDelay:
         """How long after its command a movement begins."""
@@ -358,6 +382,8 @@ class HealthyModel:
         total = np.logaddexp(log_sum(terms, axis=-1), self.outlier_log_density)
         trust = np.where(usable, np.exp(terms.max(axis=-1) - total), 0.0)
         scatter = at_best(found.poses) - self.settle(base, direction, self.none_held)
+        if isinstance(evidence.movements, Stretches):  # on the way a lag looks like scatter
+            trust = np.where(evidence.movements.at_rest, trust, 0.0)
         return Standing(outcomes.lost[best], base, trust[..., None] * scatter)
 
     def explain(self, evidence: SettledEvidence, outcomes: CommandOutcomes) -> Explanation:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin.core.errors import InputError
+from failuretwin.core.movements import Stretches
 from failuretwin.core.runs import time_step
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.inference.observation.evidence import SettledEvidence
@@ -139,6 +140,14 @@ class LogCorrection:
             target=self.command(known.target),
             ramp_duration=np.where(np.isfinite(known.ramp_duration), duration, np.nan),
         )
+        if isinstance(movements, Stretches):
+            movements = replace(
+                movements,
+                beginning=self.command(movements.beginning),
+                speed=movements.speed @ self.C.T,
+                bend=movements.bend @ np.abs(self.C).T,
+                done=movements.done @ order.T,
+            )
         return replace(evidence, movements=movements, point=self.point(evidence.point))
 
     def runs(self, runs: xr.Dataset) -> xr.Dataset:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.movements import Stretches
 from failuretwin.inference.engine.registration import displaced_posterior, robot_posterior
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.faults.priors import Priors
@@ -33,6 +34,7 @@ def shared_posterior(
         return compute_posterior(likelihood, hypotheses, priors)
     if in_doubt:
         return displaced_posterior(likelihood, hypotheses, priors)
-    if layout_of(likelihood.model).offsets or likelihood.model.sensors.in_doubt:
+    unknown = layout_of(likelihood.model).offsets or likelihood.model.sensors.in_doubt
+    if unknown or isinstance(likelihood.evidence.movements, Stretches):
         return robot_posterior(likelihood, hypotheses, priors)
     return compute_posterior(likelihood, hypotheses, priors)

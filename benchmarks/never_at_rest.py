@@ -1,0 +1,256 @@
+"""Arms that never rest: every run a continuous motion, simulated, nothing known of the robot.
+
+    python benchmarks/never_at_rest.py [--robot armpi_fpv ur5e so101 panda] [--motion blended ...]
+        [--rate 10] [--calibration generic] [--healthy 20] [--faulty 3] [--clock 0.0]
+
+Five motions, ten seconds each: point to point without a stop, sinusoids, splines as of a leader
+arm, set points at 125 Hz, pick and place in a loop. Each run is of another robot, drawn from what
+its class is like: bias, sag, friction, lag; scatter wanders within a second or so. A motor gets
+stuck at any time, or is off by two to four times what can be seen of it: by another error after each
+stroke, or, on curves, by one that comes in mid-run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time as clock
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from telling import nats, right
+
+import failuretwin as ft
+from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.runs import RunTable, Truth, concatenate
+from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.arm_classes import generic_imperfections
+from failuretwin.digital_model.nonidealities import vary
+from failuretwin.digital_model.robot import Robot, load_robot
+from failuretwin.digital_model.servo import first_order_lag
+from failuretwin.digital_model.settling import Settling
+from failuretwin.digital_model.twin import DigitalTwin, Drive, ServoEngine
+from failuretwin.inference.observation.healthy_model import HealthyModel
+
+STEP_S, DURATION_S = 0.008, 10.0
+DELAY_S, LAG_S = (0.0, 0.05), (0.02, 0.05)
+"""Ranges of dead time and lag that robots are drawn from [s]."""
+STIFFNESS = 0.4
+"""Deviation of the logarithm of compliances that robots are drawn from."""
+WANDER_S = 1.0
+"""Time within which the scatter of a moving motor is another [s]."""
+NOISE_OF_REACH = 5e-4
+"""Noise of the tool sensor on each axis, in the reach."""
+
+Path = Callable[[Robot, FloatArray, np.random.Generator], tuple[FloatArray, FloatArray]]
+"""Command (time, motor) [rad] of a robot at some times, and when strokes end [s]; none of curves."""
+
+
+def _range(robot: Robot) -> tuple[FloatArray, FloatArray]:
+    low, high = np.array([motor.movement_range for motor in robot.motors]).T
+    return low, high
+
+
+def blended(
+    robot: Robot, time: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return ramps from target to target, each beginning where the last one ends."""
+    low, high = _range(robot)
+    ends = np.r_[0.0, np.cumsum(rng.uniform(0.9, 1.6, 12))]
+    targets = rng.uniform(low, high, (len(ends), len(low)))
+    return np.stack([np.interp(time, ends, one) for one in targets.T], axis=-1), ends
+
+
+def sinusoids(
+    robot: Robot, time: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return a sum of two sinusoids for each motor."""
+    low, high = _range(robot)
+    frequency = rng.uniform(0.08, 0.35, (2, len(low)))
+    phase, share = rng.uniform(0.0, 2.0 * np.pi, (2, len(low))), rng.uniform(0.3, 0.7, len(low))
+    wave = np.sin(2.0 * np.pi * frequency * time[:, None, None] + phase)
+    mixed = share * wave[:, 0] + (1.0 - share) * wave[:, 1]
+    return 0.5 * (low + high) + 0.5 * (high - low) * mixed, np.zeros(0)
+
+
+def splines(
+    robot: Robot, time: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return smooth curves through irregular points, as a person guides a leader arm."""
+    low, high = _range(robot)
+    at = np.r_[0.0, np.cumsum(rng.uniform(0.5, 1.8, 24))]
+    found = CubicSpline(at, rng.uniform(low, high, (len(at), len(low))))(time)
+    return np.clip(found, low, high), np.zeros(0)
+
+
+def set_points(
+    robot: Robot, time: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return minimum-jerk strokes streamed as set points, as servoj does, none at rest."""
+    low, high = _range(robot)
+    at = np.r_[0.0, np.cumsum(rng.uniform(1.0, 2.0, 14))]
+    targets = rng.uniform(low, high, (len(at), len(low)))
+    place = np.clip(np.searchsorted(at, time, side="right") - 1, 0, len(at) - 2)
+    share = ((time - at[place]) / np.diff(at)[place])[:, None]
+    smooth = 0.5 * share + 0.5 * (10 * share**3 - 15 * share**4 + 6 * share**5)
+    return targets[place] + smooth * (targets[place + 1] - targets[place]), at
+
+
+def pick_and_place(
+    robot: Robot, time: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return a cycle of four poses with rounded corners, again and again."""
+    low, high = _range(robot)
+    poses = rng.uniform(low, high, (4, len(low)))
+    at = np.cumsum(np.r_[0.0, np.tile(rng.uniform(0.7, 1.2, 4), 5)])
+    raw = np.stack([np.interp(time, at, np.tile(one, 6)[: len(at)]) for one in poses.T], axis=-1)
+    width = round(0.2 / STEP_S)
+    padded = np.pad(raw, ((width, width), (0, 0)), mode="edge")
+    kernel = np.ones(2 * width + 1) / (2 * width + 1)
+    return np.stack([np.convolve(one, kernel, mode="valid") for one in padded.T], axis=-1), at
+
+
+MOTIONS: dict[str, Path] = {
+    "blended": blended,
+    "sinusoids": sinusoids,
+    "splines": splines,
+    "set_points": set_points,
+    "pick_and_place": pick_and_place,
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run to simulate: its fault, and its seed."""
+
+    fault: str
+    motor: int
+    seed: int
+
+
+def cases(robot: Robot, healthy: int, faulty: int, seed: int) -> Iterator[Case]:
+    """Yield healthy runs, and some of each motor and mode."""
+    for n in range(healthy):
+        yield Case("healthy", -1, seed + n)
+    for motor in range(len(robot.motors)):
+        for mode in ("stuck", "steady_state_error"):
+            for n in range(faulty):
+                yield Case(mode, motor, seed + 1000 * (motor + 1) + n)
+
+
+def simulated(robot: Robot, motion: Path, case: Case, rate: float, late: float) -> RunTable:
+    """Return one run of a robot of its own."""
+    rng = np.random.default_rng([case.seed, len(robot.motors)])
+    time = STEP_S * np.arange(round(DURATION_S / STEP_S) + 1)
+    (command, strokes), motors = motion(robot, time, rng), len(robot.motors)
+    usual = generic_imperfections(robot)
+    settling = vary(usual, rng).settling or Settling.ideal(motors)
+    stiffness = np.exp(STIFFNESS * rng.standard_normal(motors))
+    compliance = np.asarray((usual.settling or settling).compliance) * stiffness
+    knots = np.arange(0.0, DURATION_S + 2.0 * WANDER_S, WANDER_S)
+    scatter = CubicSpline(knots, rng.standard_normal((len(knots), motors)))(time)
+    scatter *= np.asarray(settling.scatter)
+    model = HealthyModel.of(robot, usual)
+    error, onset = np.zeros((len(time), motors)), np.nan
+    if case.fault == "steady_state_error":
+        onset = 0.0 if len(strokes) else rng.uniform(0.2, 0.5) * DURATION_S
+        error[:, case.motor] = _errors(time, strokes, onset, rng) * model.least_visible[case.motor]
+    speed = np.gradient(command, STEP_S, axis=0)
+    friction = np.asarray(settling.friction) * np.tanh(speed / 0.02)
+    wanted = command + np.asarray(settling.bias) - friction + scatter + error
+    delay = rng.uniform(*DELAY_S)
+    wanted = np.stack([np.interp(time - delay, time, one) for one in wanted.T], axis=-1)
+    wanted = first_order_lag(wanted.T, wanted[0], STEP_S, rng.uniform(*LAG_S)).T
+    held = np.zeros((1, len(time), motors), dtype=bool)
+    if case.fault == "stuck":
+        onset = rng.uniform(0.0, 0.7 * DURATION_S)
+        held[0, time >= onset, case.motor] = True
+    drive = Drive(wanted[None], held, compliance=compliance[None])
+    position = ServoEngine(robot).angles(drive, time)[0]
+    name = "healthy" if case.motor < 0 else f"{robot.motor_names[case.motor]}:{case.fault}"
+    return RunTable(
+        run=[f"{name}/{case.seed}"],
+        motor=robot.motor_names,
+        time=time,
+        command=command[None],
+        measured=_sensed(robot, position, time, rate, late, rng)[None],
+        measured_rate_hz=rate,
+        truth=Truth(
+            [name], [{}], np.array([onset]), np.array([np.sqrt(np.mean(error**2)) * motors**0.5])
+        ),
+        attributes={"robot": robot.name, "source": "simulated"},
+    )
+
+
+def _errors(
+    time: FloatArray, strokes: FloatArray, onset: float, rng: np.random.Generator
+) -> FloatArray:
+    """Return errors, (time,), two to four times what can be seen: of each stroke, or of a curve."""
+    if not len(strokes):
+        return np.where(time >= onset, rng.uniform(2.0, 4.0) * rng.choice([-1.0, 1.0]), 0.0)
+    size = rng.uniform(2.0, 4.0, len(strokes)) * rng.choice([-1.0, 1.0], len(strokes))
+    return np.interp(time, strokes, size)
+
+
+def _sensed(
+    robot: Robot,
+    position: FloatArray,
+    time: FloatArray,
+    rate: float,
+    late: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    at = np.arange(0.0, DURATION_S, 1.0 / rate)
+    seen = np.stack([np.interp(at - late, time, one) for one in position.T], axis=-1)
+    if robot.profile.sensor_pose == "log":
+        units = robot.servo_units
+        seen = units.to_rad(np.round(units.to_counts(seen)))
+        points = DigitalTwin(robot).path(seen)
+    else:
+        points = DigitalTwin(robot).path(seen)
+        points = points + rng.normal(0.0, NOISE_OF_REACH * robot.reach, points.shape)
+    measured = np.full((len(time), 3), np.nan)
+    measured[np.rint(at / STEP_S).astype(int)] = points
+    return measured
+
+
+def line(found: list[Diagnosis], seconds: float) -> str:
+    """Return what was found of some runs."""
+    healthy = [d for d in found if d.truth == "healthy"]
+    false = sum(d.diagnosis != "healthy" for d in healthy)
+    parts = [f"healthy blamed {false} of {len(healthy)}"]
+    for mode in ("stuck", "steady_state_error"):
+        some = [d for d in found if str(d.truth).endswith(mode)]
+        parts.append(f"{mode} {int(right(some).sum())} of {len(some)}")
+    sure = sum(d.diagnosis != d.truth and max(d.posterior.values()) > 0.99 for d in found)
+    parts.append(f"wrong above 99 % {sure}, {nats(found).mean():.3f} nats")
+    parts.append(f"{1e3 * seconds / len(found):.0f} ms a run")
+    return ", ".join(parts)
+
+
+def main() -> None:
+    """Judge all motions of all robots."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--robot", nargs="+", default=["armpi_fpv", "so101", "ur5e", "panda"])
+    parser.add_argument("--motion", nargs="+", default=list(MOTIONS), choices=list(MOTIONS))
+    parser.add_argument("--rate", type=float, default=10.0)
+    parser.add_argument("--calibration", default="generic")
+    parser.add_argument("--healthy", type=int, default=20)
+    parser.add_argument("--faulty", type=int, default=3)
+    parser.add_argument("--clock", type=float, default=0.0)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    for name in given.robot:
+        robot = load_robot(name)
+        for motion in given.motion:
+            some = list(cases(robot, given.healthy, given.faulty, given.seed))
+            tables = [simulated(robot, MOTIONS[motion], c, given.rate, given.clock) for c in some]
+            runs = concatenate([table.to_dataset() for table in tables])
+            began = clock.process_time()
+            found = ft.diagnose(runs, robot, given.calibration)
+            print(f"{name} {motion}: {line(found, clock.process_time() - began)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,224 @@
+"""Moments on the way: what runs say of movements whose end was not seen at rest.
+
+A stretch is the part of a movement up to one reading. The tool is expected where the command was a
+lag before; whoever starts early or late, or follows with another lag, is off along the motion:
+
+    e_k = y(q(t_k - lag)) - J qd (lag of each motor),    variance along it (qd sigma)^2
+
+A rest is a stretch with qd = 0. Readings near each other share one lag and one scatter: they are
+pooled.
+
+Section: docs/inference.md#moments
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import numpy as np
+
+from failuretwin.core.movements import Stretches
+from failuretwin.core.types import FloatArray, IntArray, as_floats
+from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
+from failuretwin.inference.observation.healthy_model import HealthyModel
+
+SHARE = 0.85
+"""Share of a stretch's time at which it is read: late, so that what a motor was told shows, and
+before the next command may have come."""
+APART_S = 1.0
+"""Time from one moment on the way to the next [s]; nearer readings share one lag."""
+POOLED_S = 0.12
+"""Readings this near to that of a moment are pooled with it [s]."""
+STANDS_S = 0.12
+"""So long after its ramp a tool stands where it was told, give or take its settling [s]."""
+CORNER_S = 0.06
+"""Speed is the mean over twice that [s]: near a corner of the command a lag tells which it is."""
+BEND_S = 0.05
+"""Time constant with which motors follow [s], assumed: where a command accelerates by a they are off
+the same command a lag before by half its square times a."""
+CURVED_RAD = 0.01
+"""A movement whose command strays further from straight ramps is a curve [rad]."""
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """One stretch of one run; see `Stretches`."""
+
+    movement: int
+    start: float
+    time: float
+    point: FloatArray
+    origin: FloatArray
+    target: FloatArray
+    ramp: FloatArray
+    speed: FloatArray
+    bend: FloatArray
+    done: FloatArray
+    whole: bool
+    curved: bool
+
+
+def on_the_way(evidence: Evidence, model: HealthyModel) -> SettledEvidence:
+    """Return settled positions, and moments on the way of movements without.
+
+    Where every movement was seen at rest, that is what `Evidence.settled` says.
+
+    Args:
+        evidence: What the runs say.
+        model: The healthy robot: its mean lag, and how early its ramps end.
+    """
+    settled = evidence.settled
+    unseen = settled.movements.exists & ~settled.usable
+    if not model.sensors.tool_alone or not unseen.any():
+        return settled
+    looks = _Looks(evidence, model)
+    found = {(run, m): looks.moments(run, m) for run, m in np.argwhere(unseen).tolist()}
+    if not any(found.values()):
+        return settled
+    return _joined(settled, found)
+
+
+@dataclass(frozen=True)
+class _Looks:
+    """Reads moments on the way of single movements."""
+
+    evidence: Evidence
+    model: HealthyModel
+
+    def moments(self, run: int, m: int) -> list[_Moment]:
+        """Return the moments on the way of a movement."""
+        settled, lag = self.evidence.settled, self.model.lag_s
+        movements = settled.movements
+        time, read = as_floats(self.evidence.runs["time"].values), self.evidence.read[run]
+        start, end = movements.start[run, m], settled.end[run, m]
+        seen = np.flatnonzero(read & (time > start + lag) & (time < end - 1e-9))
+        if not len(seen):
+            return []
+        curved = self._is_curved(run, m)
+        early = 0.0 if curved else self.model.shortening
+        longest = movements.ramp_duration[run, m].max() * (1.0 - early)
+        stood = time[seen[-1]] - start - lag
+        if not curved and stood > longest + STANDS_S:
+            length, share = stood, 1.0
+        else:
+            length, share = min(longest, end - start - lag), SHARE
+        count = max(1, int(round(length / APART_S)))
+        wanted = start + lag + length * (np.arange(count) + share) / count
+        nearest = np.unique(np.argmin(np.abs(time[seen] - wanted[:, None]), axis=1))
+        found, before = [], start
+        for at in seen[nearest].tolist():
+            found.append(self._moment(run, m, at, before, early, curved))
+            before = time[at] - lag
+        if len(found) > 1:
+            found = [replace(one, whole=False) for one in found]
+        return found
+
+    def _moment(
+        self, run: int, m: int, at: int, begin: float, early: float, curved: bool
+    ) -> _Moment:
+        time = as_floats(self.evidence.runs["time"].values)
+        start = self.evidence.settled.movements.start[run, m]
+        end = self.evidence.settled.end[run, m]
+
+        def told(when: FloatArray) -> FloatArray:
+            """Return what the motors have been told that is to be seen, (time, motor) [rad]."""
+            since = (when - self.model.lag_s - start) / (1.0 - early)
+            return self._command(run, np.minimum(start + since, max(end, start)))
+
+        near = self._near(run, at)
+        point = self.evidence.readings.point[run]
+        pose = told(np.append(time[near], time[at]))
+        path = self.model.sensors.expected(pose)[0]
+        off = np.median(point[near] - path[:-1], axis=0)
+        ends = told(time[at] + CORNER_S * np.array([-1.0, 1.0]))
+        lasted = (time[at] - self.model.lag_s - begin) / (1.0 - early)
+        ramp = np.maximum(self.evidence.settled.movements.ramp_duration[run, m], 1e-3)
+        return _Moment(
+            m,
+            begin,
+            time[at],
+            path[-1] + off,
+            self._command(run, np.array([begin]))[0],
+            pose[-1],
+            np.minimum(ramp, lasted),
+            (ends[1] - ends[0]) / (2.0 * CORNER_S),
+            0.5 * (BEND_S / CORNER_S) ** 2 * np.abs(ends[0] - 2.0 * pose[-1] + ends[1]),
+            np.clip((time[at] - self.model.lag_s - start) / (1.0 - early) / ramp, 0.0, 1.0)
+            if not curved
+            else np.ones_like(ramp),
+            not curved,
+            curved,
+        )
+
+    def _near(self, run: int, at: int) -> IntArray:
+        """Return the readings about one, as many before as after: what a fault adds cancels."""
+        time = as_floats(self.evidence.runs["time"].values)
+        near = np.flatnonzero(self.evidence.read[run] & (np.abs(time - time[at]) <= POOLED_S))
+        place = int(np.searchsorted(near, at))
+        count = min(place, len(near) - 1 - place)
+        return near[place - count : place + count + 1]
+
+    def _command(self, run: int, when: FloatArray) -> FloatArray:
+        """Return the command at some times, (time, motor) [rad]."""
+        time = as_floats(self.evidence.runs["time"].values)
+        command = as_floats(self.evidence.runs["command"].values[run])
+        return np.stack([np.interp(when, time, one) for one in command.T], axis=-1)
+
+    def _is_curved(self, run: int, m: int) -> bool:
+        """Return whether the command of a movement strays from straight ramps."""
+        settled = self.evidence.settled
+        time = as_floats(self.evidence.runs["time"].values)
+        start, end = settled.movements.start[run, m], settled.end[run, m]
+        when = time[(time >= start) & (time <= end)]
+        straight = settled.movements[run : run + 1].reference(when)[0]
+        return bool(np.abs(self._command(run, when) - straight).max(initial=0.0) > CURVED_RAD)
+
+
+def _joined(
+    settled: SettledEvidence, found: dict[tuple[int, int], list[_Moment]]
+) -> SettledEvidence:
+    """Return settled positions with moments on the way in place of movements without."""
+    movements = settled.movements
+    origin = movements.origin()
+    plan = [
+        [
+            (m, moment)
+            for m in np.flatnonzero(movements.exists[run]).tolist()
+            for moment in found.get((run, m)) or [None]
+        ]
+        for run in range(len(settled.usable))
+    ]
+    count = max(len(one) for one in plan)
+    motors, axes = movements.initial.shape[1], settled.point.shape[-1]
+    made = SettledEvidence.empty(run=len(plan), movement=count, motor=motors, axis=axes)
+    stretches = Stretches.empty(run=len(plan), movement=count, motor=motors)
+    stretches.initial[:] = movements.initial
+    for run, entries in enumerate(plan):
+        for k, (m, moment) in enumerate(entries):
+            made.put((run, k), settled[run, m])
+            stretches.target[run, k] = movements.target[run, m]
+            stretches.ramp_duration[run, k] = movements.ramp_duration[run, m]
+            stretches.start[run, k] = movements.start[run, m]
+            stretches.beginning[run, k] = origin[run, m]
+            stretches.movement[run, k] = m
+            if moment is not None:
+                _put(made, stretches, (run, k), moment)
+    return replace(made, movements=stretches)
+
+
+def _put(made: SettledEvidence, stretches: Stretches, at: tuple[int, int], moment: _Moment) -> None:
+    made.point[at], made.usable[at], made.moving[at] = moment.point, True, False
+    made.begin[at] = made.end[at] = moment.time
+    stretches.target[at], stretches.ramp_duration[at] = moment.target, moment.ramp
+    stretches.start[at], stretches.beginning[at] = moment.start, moment.origin
+    stretches.speed[at], stretches.at_rest[at] = moment.speed, False
+    stretches.whole[at], stretches.curved[at] = moment.whole, moment.curved
+    stretches.bend[at], stretches.done[at] = moment.bend, moment.done
+
+
+def beside(moving: TransientSamples, moments: SettledEvidence) -> TransientSamples:
+    """Return readings on the way without those of moments, movement by movement of these."""
+    stretches = moments.movements
+    if not isinstance(stretches, Stretches):
+        return moving
+    runs = np.arange(len(stretches.movement))[:, None]
+    return moving[runs, stretches.movement].where(stretches.at_rest & stretches.exists)
