@@ -6,8 +6,8 @@
 Five motions, ten seconds each: point to point without a stop, sinusoids, splines as of a leader
 arm, set points at 125 Hz, pick and place in a loop. Each run is of another robot, drawn from what
 its class is like: bias, sag, friction, lag; scatter wanders within a second or so. A motor gets
-stuck at any time, or is off by two to four times what can be seen of it: by another error after each
-stroke, or, on curves, by one that comes in mid-run.
+stuck at any time, or is off by two to four times what can be seen of it: by another error after
+each stroke, or, on curves, by one that comes in mid-run.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ NOISE_OF_REACH = 5e-4
 """Noise of the tool sensor on each axis, in the reach."""
 
 Path = Callable[[Robot, FloatArray, np.random.Generator], tuple[FloatArray, FloatArray]]
-"""Command (time, motor) [rad] of a robot at some times, and when strokes end [s]; none of curves."""
+"""Command (time, motor) [rad] of a robot, and when its strokes end [s]; curves have none."""
 
 
 def _range(robot: Robot) -> tuple[FloatArray, FloatArray]:

@@ -126,7 +126,8 @@ def filter_rows(rows: FilterRows) -> RowsPosterior:
     f, whole = rows.prior
     log_evidence = np.zeros((count, moments))
     information = np.zeros((count, moments, channels, channels))
-    shift, shares, weights = np.zeros((count, moments, channels)), [], []
+    shift = np.zeros((count, moments, channels))
+    shares, weights = list[FloatArray](), list[FloatArray]()
     for m in range(moments):
         mixture = rows.mixture_at(m)
         if rows.kept[:, m].any():

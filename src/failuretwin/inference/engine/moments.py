@@ -91,6 +91,10 @@ def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
     outcomes = model.filtered_outcomes(evidence, usual, density)
     movements = evidence.movements
     target, origin = np.nan_to_num(movements.target), np.nan_to_num(movements.origin())
+    if isinstance(movements, Stretches):  # a command is lost as a whole
+        part = ~(movements.whole | movements.at_rest)[..., None] & outcomes.lost.any(axis=-1)
+        possible = np.where(part, -np.inf, outcomes.log_weight)
+        outcomes = replace(outcomes, log_weight=possible)
     chosen, kept = _likeliest(outcomes)
     base, direction, weight = kept
     lost = outcomes.lost[chosen]
@@ -123,8 +127,8 @@ def _on_the_way(
 ) -> Moments:
     """Return moments of which some are on the way.
 
-    Where a stretch is all that is seen of a movement, its motors may have missed the command, or
-    may not have set out yet, all of them.
+    Where a stretch is all that is seen of a movement, its motors may not have set out yet, all of
+    them: one outcome more.
 
     Args:
         moments: As if all were at rest.
@@ -133,32 +137,49 @@ def _on_the_way(
         jitter_s: Deviation of when a motor starts [s].
     """
     way = ~stretches.at_rest & stretches.exists
-    whole = stretches.whole | stretches.at_rest
-    never = ~whole[..., None] & moments.lost.any(axis=-1)
-    weight = np.where(never, -np.inf, moments.log_weight)
-    late = np.where(way & whole, np.maximum(late, LATE_RATE), 0.0)
-    waits = weight[..., :1] + log_of(late)[..., None]
-    weight = np.concatenate([weight + log_of(1.0 - late)[..., None], waits], axis=-1)
-    speed = np.where(moments.lost, 0.0, stretches.speed[:, :, None])
-    bend = np.where(moments.lost, 0.0, stretches.bend[:, :, None])
     kept, same = np.zeros(way.shape), way[:, 1:]
     same = same & (stretches.movement[:, 1:] == stretches.movement[:, :-1])
     kept[:, 1:] = np.where(same, np.where(stretches.curved[:, 1:], KEPT_ON_CURVES, 1.0), 0.0)
+    speed, bend = (
+        np.where(moments.lost, 0.0, values[:, :, None])
+        for values in (stretches.speed, stretches.bend)
+    )
+    found = replace(
+        moments,
+        speed=speed,
+        late=(speed * jitter_s) ** 2 + bend**2,
+        done=stretches.done,
+        kept=kept,
+    )
+    waits = way & stretches.whole
+    return _with_waiting(found, np.where(waits, np.maximum(late, LATE_RATE), 0.0))
 
-    def with_waiting(values: FloatArray, waiting: FloatArray) -> FloatArray:
-        return np.concatenate([values, waiting[:, :, None]], axis=2)
+
+def _with_waiting(moments: Moments, late: FloatArray) -> Moments:
+    """Return moments with one outcome more: that no motor has set out yet.
+
+    Args:
+        moments: Without it.
+        late: Its probability, (run, moment).
+    """
+    if not late.any():
+        return moments
+    still = np.zeros_like(moments.base[:, :, :1])
+    weight = moments.log_weight
+    waits = weight[..., :1] + log_of(late)[..., None]
+
+    def more(name: str, values: FloatArray) -> FloatArray:
+        return np.concatenate([getattr(moments, name), values], axis=2)
 
     return replace(
         moments,
-        base=with_waiting(moments.base, moments.origin),
-        direction=with_waiting(moments.direction, moments.direction[:, :, 0]),
-        lost=with_waiting(moments.lost, np.ones_like(moments.lost[:, :, 0])),
-        log_weight=weight,
+        base=more("base", moments.origin[:, :, None]),
+        direction=more("direction", moments.direction[:, :, :1]),
+        lost=np.concatenate([moments.lost, np.ones_like(moments.lost[:, :, :1])], axis=2),
+        log_weight=np.concatenate([weight + log_of(1.0 - late)[..., None], waits], axis=-1),
         outcome=np.concatenate([moments.outcome, np.zeros_like(moments.outcome[..., :1])], axis=-1),
-        speed=with_waiting(speed, np.zeros_like(moments.origin)),
-        late=with_waiting((speed * jitter_s) ** 2 + bend**2, np.zeros_like(moments.origin)),
-        done=stretches.done,
-        kept=kept,
+        speed=more("speed", still),
+        late=more("late", still),
     )
 
 

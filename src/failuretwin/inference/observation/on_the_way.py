@@ -14,6 +14,7 @@ Section: docs/inference.md#moments
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+
 import numpy as np
 
 from failuretwin.core.movements import Stretches
@@ -33,8 +34,8 @@ STANDS_S = 0.12
 CORNER_S = 0.06
 """Speed is the mean over twice that [s]: near a corner of the command a lag tells which it is."""
 BEND_S = 0.05
-"""Time constant with which motors follow [s], assumed: where a command accelerates by a they are off
-the same command a lag before by half its square times a."""
+"""Time constant with which motors follow [s], assumed: where a command accelerates by a, they are
+off the same command a lag before by half its square times a."""
 CURVED_RAD = 0.01
 """A movement whose command strays further from straight ramps is a curve [rad]."""
 
@@ -101,7 +102,7 @@ class _Looks:
             length, share = stood, 1.0
         else:
             length, share = min(longest, end - start - lag), SHARE
-        count = max(1, int(round(length / APART_S)))
+        count = max(1, round(length / APART_S))
         wanted = start + lag + length * (np.arange(count) + share) / count
         nearest = np.unique(np.argmin(np.abs(time[seen] - wanted[:, None]), axis=1))
         found, before = [], start
@@ -179,11 +180,12 @@ def _joined(
     """Return settled positions with moments on the way in place of movements without."""
     movements = settled.movements
     origin = movements.origin()
+    nothing: list[_Moment | None] = [None]
     plan = [
         [
             (m, moment)
             for m in np.flatnonzero(movements.exists[run]).tolist()
-            for moment in found.get((run, m)) or [None]
+            for moment in (found.get((run, m)) or nothing)
         ]
         for run in range(len(settled.usable))
     ]
