@@ -103,7 +103,7 @@ def watch(
             watch_until_end(shadow, console(), time.monotonic() + length, prober)
     arm = statuses(shadow.snapshot.answer, model.motor_names)[0]
     tell(fit_of(diagnoser))
-    tell(f"last answer: {arm.message}")
+    tell(f"last answer: {arm}")
 
 
 @click.command()
