@@ -56,7 +56,8 @@ def calibrate(
     from failuretwin.connection.calibration import step_parameters
     from failuretwin.connection.calibration.result import check_calibration_file
 
-    check_calibration_file(out)
+    name = name or out.stem
+    check_calibration_file(out, robot.model, name)
     if pool:
         if hold_out is not None or report is not None:
             raise click.UsageError("--pool reads no logs. Leave out --hold-out and --report.")
@@ -69,7 +70,7 @@ def calibrate(
     source = ", ".join(map(str, reading.logs))
     wrong = _wrong_set_up(runs, model)
     try:
-        found = ft.calibrate(runs, model, name or out.stem, source, hold_out)
+        found = ft.calibrate(runs, model, name, source, hold_out)
     except InputError as error:
         if not wrong:
             raise
@@ -104,15 +105,15 @@ def _wrong_set_up(runs: xr.Dataset, robot: ft.Robot) -> str:
     return f"{said}; what is learned of such logs is not the robot.{right}"
 
 
-def _pool(
-    calibrations: tuple[Path, ...], out: Path, name: str | None, robot: opt.RobotOptions
-) -> None:
+def _pool(calibrations: tuple[Path, ...], out: Path, name: str, robot: opt.RobotOptions) -> None:
     """Write the population that some calibrated robots come from."""
     from failuretwin.app.reports.calibration_report import population_parts
 
+    if out.resolve() in [path.resolve() for path in calibrations]:
+        raise InputError(f"{out}: is one of the calibrations to pool. Choose another --out.")
     population = ft.Population.fit(calibrations, robot.model)
     figures = population.imperfections
-    population = replace(population, imperfections=replace(figures, name=name or figures.name))
+    population = replace(population, imperfections=replace(figures, name=name))
     ft.save_calibration(population.calibration, robot.model, out)
     show(*population_parts(population.calibration, robot.model))
     tell(f"written to {out}")
