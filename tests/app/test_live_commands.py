@@ -153,6 +153,8 @@ def test_without_a_master_the_user_is_told_to_start_one(failuretwin, monkeypatch
         (("watch", "ros1", "--robot", "ur5e"), "file for --topics"),
         (("emulate", "--to", "robot.bag"), "rosbridge://HOST[:PORT] or a file that ends in .mcap"),
         (("emulate", "--to", "a.mcap", "--fault", "motor_3:stuck@soon"), "is not of the form"),
+        (("emulate", "--obey", "--to", "a.mcap"), "--obey needs a network"),
+        (("emulate", "--obey", "--speed", "2"), "stamped by clocks of speed 1, but --speed is 2"),
         (("emulate", "--to", "no/such/folder.mcap"), "cannot be written"),
         (("watch", "emulated", "--record", "live.bag"), "Give a name that ends in .mcap"),
         (("watch", ".", "--fault", "motor_3:stuck@5"), "--fault is of an"),

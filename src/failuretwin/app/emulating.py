@@ -38,11 +38,17 @@ def obey(target: str, emulation: Emulation, live: LiveOptions) -> None:
     """Publish readings and carry out the commands of a network, until interrupted.
 
     Raises:
-        InputError: If the target is no network, or cannot be reached.
+        InputError: If the target is no network, or cannot be reached, or time passes at another
+            speed than that of the programs that stamp the commands.
     """
     if not is_network(target):
         raise InputError(f"--obey needs a network to obey, but --to is {target!r}.")
-    topics, arm = load_topics(live.topics), CommandedArm(emulation, Pace(live.speed))
+    if live.speed != 1.0:
+        raise InputError(
+            f"--obey takes commands that are stamped by clocks of speed 1, but --speed is "
+            f"{live.speed:g}: stamps would not fit the movements. Leave out --speed."
+        )
+    topics, arm = load_topics(live.topics), CommandedArm(emulation, Pace())
     with open_transport(target) as transport, until_interrupted():
         sink = RosSink(RosWriter(emulation.robot, topics), transport)
         orders = RosSource(emulation.robot, topics, transport)
