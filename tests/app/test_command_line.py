@@ -11,7 +11,10 @@ import pandas as pd
 import pytest
 
 import failuretwin as package
+from failuretwin.app.cli import cli
+from failuretwin.connection.links import NETWORKS
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
+from failuretwin.decision.streaming import STREAMED
 
 CONTRACT = {
     "run",
@@ -76,6 +79,18 @@ def test_version_and_help(failuretwin):
     text = failuretwin("--help").stdout
     for verb in ("import", "simulate", "diagnose", "evaluate"):
         assert re.search(rf"^  {verb}\s", text, re.MULTILINE)
+
+
+def test_options_take_the_names_of_the_networks_and_of_the_streams():
+    options = {
+        (verb, option.opts[0]): option
+        for verb in ("act", "check", "stop", "emulate", "watch")
+        for option in cli.commands[verb].params
+    }
+    places = [options[verb, "--on"] for verb in ("act", "check", "stop")]
+    for option in (*places, options["emulate", "--to"]):
+        assert set(NETWORKS) <= set(option.metavar.split("|"))
+    assert tuple(options["watch", "--sensing"].type.choices) == STREAMED
 
 
 def test_a_line_a_run_with_the_keys_of_the_contract(results, simulated):

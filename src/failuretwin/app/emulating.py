@@ -13,10 +13,10 @@ from failuretwin.app.commands.options import LiveOptions
 from failuretwin.app.terminal import tell, until_interrupted
 from failuretwin.connection.commanded_arm import CommandedArm
 from failuretwin.connection.emulated_arm import Emulation, emulated
+from failuretwin.connection.links import NETWORKS
 from failuretwin.connection.links.base import CommandSent, Order, Reading, Sink
 from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace
 from failuretwin.connection.links.ros_link import (
-    NETWORKS,
     RosSink,
     RosSource,
     is_network,
@@ -72,7 +72,8 @@ def play(target: str, emulation: Emulation, live: LiveOptions) -> None:
     """
     zero, on_network = time.time(), is_network(target)
     if not on_network and Path(target).suffix != ".mcap":
-        raise InputError(f"--to is {target!r}, expected {NETWORKS} or a file that ends in .mcap.")
+        places = ", ".join(NETWORKS)
+        raise InputError(f"--to is {target!r}, expected {places} or a file that ends in .mcap.")
     length = live.seconds or (math.inf if on_network else _file_length(emulation.schedule))
     pace = Pace(live.speed if on_network else AS_FAST_AS_POSSIBLE)
     source, state, trouble = emulated(emulation, pace, length, zero), "", ""

@@ -10,6 +10,7 @@ import click
 
 from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import show, tell, write_json
+from failuretwin.connection.links import NETWORKS, ROS1
 from failuretwin.core.errors import InputError
 
 
@@ -79,7 +80,7 @@ def act(
 
 
 @click.command()
-@opt.place_option("ros1")
+@opt.place_option(ROS1)
 @opt.topics_option
 @opt.robot_options
 def stop(place: str, topics: Path | None, robot: opt.RobotOptions) -> None:
@@ -95,9 +96,7 @@ def stop(place: str, topics: Path | None, robot: opt.RobotOptions) -> None:
     from failuretwin.decision.acting.work import where_it_stands
 
     if place == opt.EMULATED:
-        raise InputError(
-            "an emulated arm ends with its process. Name ros1, ros2 or rosbridge://HOST."
-        )
+        raise InputError(f"an emulated arm ends with its process. Name {', '.join(NETWORKS)}.")
     with ExitStack() as stack:
         arm = commander_of(opt.ArmOptions(place, (), True, topics), robot.known, robot.seed, stack)
         target = where_it_stands(arm)

@@ -12,6 +12,7 @@ import click
 from click.core import ParameterSource
 
 import failuretwin as ft
+from failuretwin.connection.links import NETWORKS
 from failuretwin.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -289,8 +290,8 @@ def move_option(when: str = "") -> Callable[[F], F]:
 
 def place_option(default: str) -> Callable[[F], F]:
     """Return the option `--on`, the arm that takes orders: emulated by default, or a real one."""
-    kinds = f"{EMULATED}|" * (default == EMULATED) + "ros1|ros2|rosbridge://HOST[:PORT]"
-    return click.option("--on", "place", default=default, metavar=kinds, help="The arm.")
+    kinds = ((EMULATED,) if default == EMULATED else ()) + NETWORKS
+    return click.option("--on", "place", default=default, metavar="|".join(kinds), help="The arm.")
 
 
 @dataclass(frozen=True)
