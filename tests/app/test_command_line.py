@@ -93,6 +93,35 @@ def test_options_take_the_names_of_the_networks_and_of_the_streams():
     assert tuple(options["watch", "--sensing"].type.choices) == STREAMED
 
 
+OWN_SHAPE = {"--fault", "--on", "--out", "--sensing"}
+"""Options that mean something else in each command."""
+
+
+def test_an_option_of_several_commands_has_one_shape():
+    shapes = {}
+    for verb, command in cli.commands.items():
+        for option in command.params:
+            if option.opts[0] not in OWN_SHAPE:
+                shape = type(option.type), option.metavar, option.multiple, option.name
+                shapes.setdefault(option.opts[0], {}).setdefault(shape, []).append(verb)
+    several = {flag: found for flag, found in shapes.items() if len(found) > 1}
+    assert list(several) == ["source", "task"]
+
+
+@pytest.mark.parametrize("verb", ["reach", "check", "isolability"])
+@pytest.mark.parametrize("option", ["--json", "--report"])
+def test_an_output_that_cannot_be_written_is_refused_before_any_work(
+    failuretwin, tmp_path, verb, option
+):
+    (tmp_path / "file").write_text("")
+    place = "no/such/file" if option == "--json" else "file"
+    arguments = ("no_task.csv",) if verb == "reach" else ("--motions", "no_motions.json")
+    answer = failuretwin(verb, *arguments, option, place, folder=tmp_path)
+    assert answer.returncode == 2
+    assert place in answer.stderr
+    assert "no_" not in answer.stderr
+
+
 def test_a_line_a_run_with_the_keys_of_the_contract(results, simulated):
     _, records, _ = results
     assert [r["run"] for r in records] == load_run_set(simulated)["run"].values.tolist()

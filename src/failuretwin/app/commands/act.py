@@ -113,15 +113,13 @@ def stop(place: str, topics: Path | None, robot: opt.RobotOptions) -> None:
     "all over its travel.",
 )
 @opt.space_options
-@opt.report_option("Draw a map of the workspace there, reach.png.")
-@opt.json_option("Write all points.")
+@opt.output_options("Write all points.", "Draw a map of the workspace there, reach.png.")
 @opt.robot_options
 def reach(
     task: Path | None,
     fault: str | None,
     safety: opt.SafetyOptions,
-    report: Path | None,
-    json_file: Path | None,
+    output: opt.OutputOptions,
     robot: opt.RobotOptions,
 ) -> None:
     """Report what an arm can still reach: of TASK.csv, or of its usual workspace.
@@ -134,6 +132,7 @@ def reach(
     from failuretwin.decision.acting.reach import reach_by_motor, workspace
     from failuretwin.decision.acting.task import read_task
 
+    output.check()
     model, seed = robot.model, robot.seed
     gate = safety.gate(model)
     points = workspace(model, seed=seed) if task is None else read_task(task)
@@ -145,6 +144,6 @@ def reach(
         maps = [reach_of(gate, points, held_of(fault, model), seed)]
         parts, records = map_parts(maps[0], per_point=task is not None), [maps[0].record()]
     show(*parts)
-    write_json(records, json_file)
-    if report is not None:
-        save_map(maps, report)
+    write_json(records, output.json_file)
+    if output.report is not None:
+        save_map(maps, output.report)

@@ -9,18 +9,16 @@ import click
 import failuretwin as ft
 from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import show
-from failuretwin.core.errors import InputError
 
 
 @click.command()
 @click.argument("results", type=opt.PATH, metavar="RESULTS.jsonl")
-@opt.file_option(
+@opt.labelled_options(
     "--truth",
     "RUNS",
     "Run set or raw sessions with the truth, needed for the coverage of intervals. Default: "
     "the truth in the results.",
 )
-@opt.published_labels_option
 @opt.file_option("--against", "OTHER.jsonl", "Compare with other results of the same runs.")
 @opt.file_option("--latex", "FILE", "Write the scores as LaTeX tables.")
 @opt.report_option("Write a picture of the reliability.")
@@ -28,8 +26,7 @@ from failuretwin.core.errors import InputError
 @opt.robot_options
 def evaluate(
     results: Path,
-    truth: Path | None,
-    published_labels: bool,
+    labelled: opt.LabelledOptions,
     against: Path | None,
     latex: Path | None,
     report: Path | None,
@@ -42,12 +39,10 @@ def evaluate(
     from failuretwin.app.reports.reports import comparison_parts, evaluation_parts, write_latex
     from failuretwin.decision.evaluation import Truths
 
-    truths = None
+    truths, truth = None, labelled.path
     if truth is not None:
-        runs = ft.read_runs(truth, robot.robot, ft.ReadOptions(published_labels=published_labels))
-        truths = Truths.of(runs, str(truth))
-    elif published_labels:
-        raise InputError("--published-labels says how to read the truth. Add --truth RUNS.")
+        options = ft.ReadOptions(published_labels=labelled.published_labels)
+        truths = Truths.of(ft.read_runs(truth, robot.robot, options), str(truth))
     first = ft.read_results(results)
     scores = ft.evaluate(first, truths, np.random.default_rng(robot.seed))
     comparison = None

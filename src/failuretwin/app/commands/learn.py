@@ -179,19 +179,15 @@ def train(
 
 @click.command()
 @opt.file_option("--out", "DIR", "Folder for everything.", required=True)
-@opt.file_option(
-    "--test test_path",
-    "PATH",
-    "Real runs to test on. Default: runs of the physics engine, as a stand-in.",
+@opt.labelled_options(
+    "--test", "PATH", "Real runs to test on. Default: runs of the physics engine, as a stand-in."
 )
-@opt.published_labels_option
 @opt.flag_option("--quick", "A small version of about two minutes.")
 @opt.flag_option("--resume", "Continue an interrupted study.")
 @opt.robot_options
 def study(
     out: Path,
-    test_path: Path | None,
-    published_labels: bool,
+    labelled: opt.LabelledOptions,
     quick: bool,
     resume: bool,
     robot: opt.RobotOptions,
@@ -206,16 +202,14 @@ def study(
     from failuretwin.app.reports.study_page import write_study_page
     from failuretwin.decision.learned import paper_study as paper
 
-    if published_labels and test_path is None:
-        raise InputError("--published-labels says how to read a test set. Add --test PATH.")
     model, seed = robot.model, robot.seed
     plan = paper.quick_plan(seed) if quick else paper.StudyPlan(seed)
     paper.check_folder(out, resume)
     figure_class()  # better told before the work than after it
     test = (
         paper.stand_in_test_set(plan, model)
-        if test_path is None
-        else paper.given_test_set(test_path, model, published_labels)
+        if labelled.path is None
+        else paper.given_test_set(labelled.path, model, labelled.published_labels)
     )
     check_learning()
     jobs = len(plan.jobs())

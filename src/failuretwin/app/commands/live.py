@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from failuretwin.connection.links.base import Commander
 
 
-PROBING = ("idle", "move", "speed_share", "floor", "radius")
+PROBING = ("idle", "move", *opt.names_of(opt.SafetyOptions))
 """Options of `watch` for its movements of the arm."""
 
 

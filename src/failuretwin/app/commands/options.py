@@ -46,14 +46,18 @@ def flag_option(flag: str, text: str) -> Callable[[F], F]:
     return click.option(flag, is_flag=True, help=text)
 
 
+def names_of(kind: type) -> tuple[str, ...]:
+    """Return the names of the parameters that a group of options has."""
+    return tuple(field.name for field in fields(kind))
+
+
 def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F], F]:
     """Return a decorator that adds options; the command gets them as one argument, of `kind`."""
 
     def decorate(command: F) -> F:
         @wraps(command)
         def with_one(**told: Any) -> Any:
-            names = [field.name for field in fields(kind) if field.name in told]
-            own = {option: told.pop(option) for option in names}
+            own = {option: told.pop(option) for option in names_of(kind) if option in told}
             return command(**told, **{name: kind(**own)})
 
         decorated: Any = with_one
@@ -129,7 +133,7 @@ def calibrated_robot_options(default: str | None = None) -> Callable[[F], F]:
 
 def report_option(text: str) -> Callable[[F], F]:
     """Return the option `--report DIR`."""
-    return click.option("--report", type=PATH, metavar="DIR", help=text)
+    return file_option("--report", "DIR", text)
 
 
 class HypothesesOption(click.Option):
@@ -172,7 +176,29 @@ def plugin_option(command: F) -> F:
 
 def json_option(text: str) -> Callable[[F], F]:
     """Return the option `--json FILE`."""
-    return click.option("--json", "json_file", type=PATH, metavar="FILE", help=text)
+    return file_option("--json json_file", "FILE", text)
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """Values of `output_options`: where results go."""
+
+    json_file: Path | None
+    report: Path | None
+
+    def check(self) -> None:
+        """Raise OutputError unless all outputs can be written: worth asking before work."""
+        from failuretwin.data_knowledge.store import check_fillable, check_writable
+
+        if self.json_file is not None:
+            check_writable(self.json_file)
+        if self.report is not None:
+            check_fillable(self.report)
+
+
+def output_options(json_text: str, report_text: str) -> Callable[[F], F]:
+    """Return the options `--json FILE` and `--report DIR`."""
+    return gathered(OutputOptions, "output", json_option(json_text), report_option(report_text))
 
 
 published_labels_option = flag_option(
@@ -180,6 +206,26 @@ published_labels_option = flag_option(
     "Take the truth of raw sessions from folder names that end in _label_K and freeze the "
     "motor of labels 1-4 from sample 49 on, as the authors of the data did.",
 )
+
+
+@dataclass(frozen=True)
+class LabelledOptions:
+    """Values of `labelled_options`: runs with their truth."""
+
+    path: Path | None
+    published_labels: bool
+
+    def __post_init__(self) -> None:
+        if self.path is None:
+            refuse_unused("no runs with their truth are given", "published_labels")
+
+
+def labelled_options(flag: str, metavar: str, text: str) -> Callable[[F], F]:
+    """Return an option that takes runs with their truth, and `--published-labels`."""
+    runs = file_option(f"{flag} path", metavar, text)
+    return gathered(LabelledOptions, "labelled", runs, published_labels_option)
+
+
 topics_option = file_option(
     "--topics",
     "FILE.toml",
