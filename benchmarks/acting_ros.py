@@ -99,7 +99,7 @@ def _act(
     act = ["act", str(csv), "--on", "ros1", "--move", "--json", str(out)]
     try:
         subprocess.run([*ours, *act], env=environment, capture_output=True, timeout=LONGEST_S)
-        lines = [line for line in heard.read_text().splitlines() if "% sure" in line]
+        lines = [line for line in heard.read_text().splitlines() if "  ALARM: " in line]
     finally:
         for process in others:
             _stop(process)

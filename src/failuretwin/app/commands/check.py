@@ -128,13 +128,10 @@ def check(
     """
     from failuretwin.app.arms import commander_of, is_moved
     from failuretwin.app.reports import check_report as reports
-    from failuretwin.data_knowledge.store import check_writable
 
     _refuse_unused(logs, written, motions, keep)
     before = reports.kept_checks(keep) if keep is not None and keep.exists() else []
-    if keep is not None:
-        check_writable(keep)
-    output.check()
+    output.check(keep)
     checking = motion.checking(safety, robot)
     model = checking.known.robot
     if logs:

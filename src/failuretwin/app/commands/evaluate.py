@@ -13,12 +13,13 @@ from failuretwin.app.terminal import show
 
 @click.command()
 @click.argument("results", type=opt.PATH, metavar="RESULTS.jsonl")
-@opt.labelled_options(
+@opt.file_option(
     "--truth",
     "RUNS",
     "Run set or raw sessions with the truth, needed for the coverage of intervals. Default: "
     "the truth in the results.",
 )
+@opt.published_labels_option
 @opt.file_option("--against", "OTHER.jsonl", "Compare with other results of the same runs.")
 @opt.file_option("--latex", "FILE", "Write the scores as LaTeX tables.")
 @opt.report_option("Write a picture of the reliability.")
@@ -26,7 +27,8 @@ from failuretwin.app.terminal import show
 @opt.robot_options
 def evaluate(
     results: Path,
-    labelled: opt.LabelledOptions,
+    truth: Path | None,
+    published_labels: bool,
     against: Path | None,
     latex: Path | None,
     report: Path | None,
@@ -39,9 +41,11 @@ def evaluate(
     from failuretwin.app.reports.reports import comparison_parts, evaluation_parts, write_latex
     from failuretwin.decision.evaluation import Truths
 
-    truths, truth = None, labelled.path
-    if truth is not None:
-        options = ft.ReadOptions(published_labels=labelled.published_labels)
+    truths = None
+    if truth is None:
+        opt.refuse_unused("no runs with the truth are given", "published_labels")
+    else:
+        options = ft.ReadOptions(published_labels=published_labels)
         truths = Truths.of(ft.read_runs(truth, robot.robot, options), str(truth))
     first = ft.read_results(results)
     scores = ft.evaluate(first, truths, np.random.default_rng(robot.seed))

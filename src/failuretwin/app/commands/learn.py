@@ -179,15 +179,17 @@ def train(
 
 @click.command()
 @opt.file_option("--out", "DIR", "Folder for everything.", required=True)
-@opt.labelled_options(
+@opt.file_option(
     "--test", "PATH", "Real runs to test on. Default: runs of the physics engine, as a stand-in."
 )
+@opt.published_labels_option
 @opt.flag_option("--quick", "A small version of about two minutes.")
 @opt.flag_option("--resume", "Continue an interrupted study.")
 @opt.robot_options
 def study(
     out: Path,
-    labelled: opt.LabelledOptions,
+    test: Path | None,
+    published_labels: bool,
     quick: bool,
     resume: bool,
     robot: opt.RobotOptions,
@@ -202,20 +204,22 @@ def study(
     from failuretwin.app.reports.study_page import write_study_page
     from failuretwin.decision.learned import paper_study as paper
 
+    if test is None:
+        opt.refuse_unused("no real runs are given", "published_labels")
     model, seed = robot.model, robot.seed
     plan = paper.quick_plan(seed) if quick else paper.StudyPlan(seed)
     paper.check_folder(out, resume)
     figure_class()  # better told before the work than after it
-    test = (
+    exam = (
         paper.stand_in_test_set(plan, model)
-        if labelled.path is None
-        else paper.given_test_set(labelled.path, model, labelled.published_labels)
+        if test is None
+        else paper.given_test_set(test, model, published_labels)
     )
     check_learning()
     jobs = len(plan.jobs())
     tell(f"{jobs} trainings of {plan.iterations} iterations each")
     with progress_bar("training", jobs) as advance:
-        trainings = paper.run_study(plan, model, test, out, advance)
+        trainings = paper.run_study(plan, model, exam, out, advance)
     page = out / paper.PAGE
-    write_study_page(trainings, plan, model, test, page)
+    write_study_page(trainings, plan, model, exam, page)
     tell(f"written to {page}")

@@ -186,12 +186,12 @@ class OutputOptions:
     json_file: Path | None
     report: Path | None
 
-    def check(self) -> None:
-        """Raise OutputError unless all outputs can be written: worth asking before work."""
+    def check(self, *others: Path | None) -> None:
+        """Raise OutputError unless these and other files can be written: ask before any work."""
         from failuretwin.data_knowledge.store import check_fillable, check_writable
 
-        if self.json_file is not None:
-            check_writable(self.json_file)
+        for path in filter(None, (self.json_file, *others)):
+            check_writable(path)
         if self.report is not None:
             check_fillable(self.report)
 
@@ -206,25 +206,6 @@ published_labels_option = flag_option(
     "Take the truth of raw sessions from folder names that end in _label_K and freeze the "
     "motor of labels 1-4 from sample 49 on, as the authors of the data did.",
 )
-
-
-@dataclass(frozen=True)
-class LabelledOptions:
-    """Values of `labelled_options`: runs with their truth."""
-
-    path: Path | None
-    published_labels: bool
-
-    def __post_init__(self) -> None:
-        if self.path is None:
-            refuse_unused("no runs with their truth are given", "published_labels")
-
-
-def labelled_options(flag: str, metavar: str, text: str) -> Callable[[F], F]:
-    """Return an option that takes runs with their truth, and `--published-labels`."""
-    runs = file_option(f"{flag} path", metavar, text)
-    return gathered(LabelledOptions, "labelled", runs, published_labels_option)
-
 
 topics_option = file_option(
     "--topics",

@@ -78,11 +78,9 @@ def statuses(answer: Answer, motors: Sequence[str]) -> list[Status]:
         return [Status(name, STALE, text, {}) for name in names]
     alarm = answer.alarm
     if diagnosis.undecided:
-        raised = [alarm.state == RAISED and _concerns(alarm, name) for name in names]
-        current = [
-            Status(name, STATES[RAISED] if bad else UNDECIDED, diagnosis.verdict, {})
-            for name, bad in zip(names, raised, strict=True)
-        ]
+        raised = [name for name in names if alarm.state == RAISED and _concerns(alarm, name)]
+        words = {name: STATES[RAISED] if name in raised else UNDECIDED for name in names}
+        current = [Status(name, word, diagnosis.verdict, {}) for name, word in words.items()]
     else:
         current = [_arm(diagnosis, alarm), *(_motor(diagnosis, alarm, motor) for motor in motors)]
     if answer.state != STALE:
