@@ -1,6 +1,6 @@
 """The real parts end to end: `emulate --obey`, `watch` and `act` as processes, a roscore between.
 
-    python benchmarks/acting_ros.py [--arms 12] [--speed 2]
+    python benchmarks/acting_ros.py [--arms 12]
 
 Each arm has its fault from the start, at one motor after the other. Shares of targets that `act`
 reached within 5 mm by the sensor, "of" what some safe pose can reach, and what `watch` said last
@@ -35,7 +35,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--arms", type=int, default=12)
     parser.add_argument("--targets", type=int, default=6)
-    parser.add_argument("--speed", type=float, default=2.0)
     parser.add_argument("--port", type=int, default=11411)
     told = parser.parse_args()
     robot = load_robot("armpi_fpv")
@@ -68,7 +67,7 @@ def _report(
             low, high = SCALE if fault == "encoder_scale" else ERROR_RAD
             size = float(rng.uniform(low, high))
         name = f"{robot.motor_names[motor]}:{fault}"
-        rows, said = _act(f"{name}={size:.4f}", task, arm, environment, folder, told.speed)
+        rows, said = _act(f"{name}={size:.4f}", task, arm, environment, folder)
         known = [{"held": held, "motor": motor + 1, "target": list(t.position)}
                  for t in task.targets]  # fmt: skip
         here = sum(row["reached"] for row in rows)
@@ -84,7 +83,7 @@ def _report(
 
 
 def _act(
-    fault: str, task: Task, seed: int, environment: dict[str, str], folder: Path, speed: float
+    fault: str, task: Task, seed: int, environment: dict[str, str], folder: Path
 ) -> tuple[list[dict[str, bool]], str]:
     """Return what became of the targets, and the last that `watch` said of the arm."""
     csv, out, heard = (folder / name for name in ("task.csv", "out.jsonl", "watch"))
@@ -92,7 +91,7 @@ def _act(
     csv.write_text("x,y,z\n" + points)
     out.unlink(missing_ok=True)
     ours = [sys.executable, "-m", "failuretwin"]
-    emulate = ["emulate", "--obey", "--fault", fault, "--seed", str(seed), "--speed", str(speed)]
+    emulate = ["emulate", "--obey", "--fault", fault, "--seed", str(seed)]
     others = [_start([*ours, *emulate], environment, folder / "emulate")]
     time.sleep(3.0)
     others.append(_start([*ours, "watch", "ros1"], environment, heard))
@@ -100,7 +99,7 @@ def _act(
     act = ["act", str(csv), "--on", "ros1", "--move", "--json", str(out)]
     try:
         subprocess.run([*ours, *act], env=environment, capture_output=True, timeout=LONGEST_S)
-        lines = [line for line in heard.read_text().splitlines() if "% sure" in line]
+        lines = [line for line in heard.read_text().splitlines() if "  ALARM: " in line]
     finally:
         for process in others:
             _stop(process)

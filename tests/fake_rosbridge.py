@@ -3,6 +3,7 @@
 There is no ROS behind it. It stands in for a real server, which no package registry offers, and
 can only show that we keep the protocol as it is written down:
 https://github.com/RobotWebTools/rosbridge_suite/blob/ros2/ROSBRIDGE_PROTOCOL.md
+`test_rosbridge_protocol.py` checks the messages themselves.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ class FakeRosbridge:
         self.port = port
         self.types: dict[str, str] = {}
         self.published: list[dict] = []
+        self.calls: list[dict] = []
         self._subscribers: dict[str, set] = {}
         self._connections: set = set()
         self.start()
@@ -60,6 +62,7 @@ class FakeRosbridge:
 
     def _take(self, connection, call):
         topic = call["topic"]
+        self.calls.append(call)
         if call["op"] in ("subscribe", "advertise"):
             self.types[topic] = call["type"]
         if call["op"] == "subscribe":

@@ -345,6 +345,45 @@ def test_a_bad_destination_is_refused_before_any_work(failuretwin, tmp_path, nam
     refused(answer, text)
 
 
+@pytest.mark.parametrize(
+    ("robot", "name", "text"),
+    [
+        (
+            "ur5e",
+            "twin",
+            "calibration 'twin' of robot 'ur5e', expected 'twin' of 'armpi_fpv'",
+        ),
+        ("armpi_fpv", "robot B", "calibration 'robot B' of robot 'armpi_fpv', expected 'twin' of"),
+    ],
+)
+def test_the_calibration_of_another_robot_is_not_replaced(
+    failuretwin, two_days, small, armpi, tmp_path, robot, name, text
+):
+    path = tmp_path / "twin.toml"
+    named = replace(small, imperfections=replace(small.imperfections, name=name))
+    save_calibration(named, replace(armpi, profile=replace(armpi.profile, name=robot)), path)
+    before = path.read_bytes()
+    answer = failuretwin("calibrate", two_days, "--out", path)
+    refused(answer, text, "Choose another --out; if it is the same robot, remove the file first")
+    assert path.read_bytes() == before
+
+
+def test_a_file_that_is_no_calibration_is_not_replaced(failuretwin, two_days, tmp_path):
+    path = tmp_path / "topics.toml"
+    path.write_text('command = "/command"\n')
+    refused(failuretwin("calibrate", two_days, "--out", path), "expected 'topics' of 'armpi_fpv'")
+    assert path.read_text() == 'command = "/command"\n'
+
+
+def test_a_robot_is_calibrated_again(failuretwin, two_days, small, armpi, tmp_path):
+    path = tmp_path / "twin.toml"
+    named = replace(small, imperfections=replace(small.imperfections, name="twin"))
+    save_calibration(replace(named, runs=99), armpi, path)
+    answer = failuretwin("calibrate", two_days, "--out", path)
+    assert answer.returncode == 0, answer.stderr
+    assert read_calibration(path, armpi).runs < 99
+
+
 def test_a_robot_has_its_own_calibration(failuretwin, learned, two_days, small, armpi, tmp_path):
     path = tmp_path / "small.toml"
     other = replace(armpi, profile=replace(armpi.profile, name="armpi_two"))
@@ -417,7 +456,8 @@ def test_a_full_disk_leaves_the_old_file(failuretwin, two_days, small, armpi, tm
     path = tmp_path / "twin.toml"
     save_calibration(small, armpi, path)
     before = path.read_bytes()
-    answer = failuretwin("calibrate", two_days, "--out", path, disk_full=True)
+    named = ("--name", small.imperfections.name)
+    answer = failuretwin("calibrate", two_days, "--out", path, *named, disk_full=True)
     refused(answer, "could not be written")
     assert path.read_bytes() == before
     assert listing(tmp_path) == ["twin.toml"]

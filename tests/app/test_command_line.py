@@ -11,7 +11,10 @@ import pandas as pd
 import pytest
 
 import failuretwin as package
+from failuretwin.app.cli import cli
+from failuretwin.connection.links import NETWORKS
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
+from failuretwin.decision.streaming import STREAMED
 
 CONTRACT = {
     "run",
@@ -76,6 +79,47 @@ def test_version_and_help(failuretwin):
     text = failuretwin("--help").stdout
     for verb in ("import", "simulate", "diagnose", "evaluate"):
         assert re.search(rf"^  {verb}\s", text, re.MULTILINE)
+
+
+def test_options_take_the_names_of_the_networks_and_of_the_streams():
+    options = {
+        (verb, option.opts[0]): option
+        for verb in ("act", "check", "stop", "emulate", "watch")
+        for option in cli.commands[verb].params
+    }
+    places = [options[verb, "--on"] for verb in ("act", "check", "stop")]
+    for option in (*places, options["emulate", "--to"]):
+        assert set(NETWORKS) <= set(option.metavar.split("|"))
+    assert tuple(options["watch", "--sensing"].type.choices) == STREAMED
+
+
+OWN_SHAPE = {"--fault", "--on", "--out", "--sensing"}
+"""Options that mean something else in each command."""
+
+
+def test_an_option_of_several_commands_has_one_shape():
+    shapes = {}
+    for verb, command in cli.commands.items():
+        for option in command.params:
+            if option.opts[0] not in OWN_SHAPE:
+                shape = type(option.type), option.metavar, option.multiple, option.name
+                shapes.setdefault(option.opts[0], {}).setdefault(shape, []).append(verb)
+    several = {flag: found for flag, found in shapes.items() if len(found) > 1}
+    assert list(several) == ["source", "task"]
+
+
+@pytest.mark.parametrize("verb", ["reach", "check", "isolability"])
+@pytest.mark.parametrize("option", ["--json", "--report"])
+def test_an_output_that_cannot_be_written_is_refused_before_any_work(
+    failuretwin, tmp_path, verb, option
+):
+    (tmp_path / "file").write_text("")
+    place = "no/such/file" if option == "--json" else "file"
+    arguments = ("no_task.csv",) if verb == "reach" else ("--motions", "no_motions.json")
+    answer = failuretwin(verb, *arguments, option, place, folder=tmp_path)
+    assert answer.returncode == 2
+    assert place in answer.stderr
+    assert "no_" not in answer.stderr
 
 
 def test_a_line_a_run_with_the_keys_of_the_contract(results, simulated):

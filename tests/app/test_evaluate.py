@@ -196,7 +196,7 @@ def test_a_fault_that_is_no_hypothesis_is_judged_as_unknown(evaluate, folder):
         (["stranger.jsonl", "--truth", "runs.nc"], "Expected the runs that were diagnosed"),
         (["ours.jsonl", "--against", "other.jsonl"], "run 'f' is motor_1:stuck there, but motor_2"),
         (["ours.jsonl", "--against", "nowhere.jsonl"], "nowhere.jsonl: cannot be read"),
-        (["ours.jsonl", "--published-labels"], "Add --truth RUNS"),
+        (["ours.jsonl", "--published-labels"], "the truth are given: leave out --published-labels"),
         (["bare.jsonl"], "bare.jsonl: no run says what was true. Give a run set that does with"),
         (["ours.jsonl", "--truth", "nowhere.nc"], "nowhere.nc: does not exist"),
         (["ours.jsonl", "--latex", "nowhere/x.tex"], "folder nowhere does not exist"),

@@ -48,14 +48,24 @@ def recording(failuretwin, tmp_path_factory):
 
 def check_found(changes):
     """Check that motor 3 is found stuck after it began, and healthy after it was repaired."""
-    stuck = [at for at, text in changes if text.startswith("motor 3 stuck")]  # not: suspected
+    stuck = [at for at, text in changes if text.startswith("ALARM: motor 3 stuck")]
     assert stuck
     assert 12.0 < stuck[0] < 25.0
-    assert [text.startswith("healthy again") for at, text in changes if at > 25.0][-1]
+    assert [text.startswith("CLEARED:") for at, text in changes if at > 25.0][-1]
 
 
 def test_an_emulated_robot_is_watched(watched):
     check_found(told(watched[0]))
+
+
+def test_an_alarm_that_is_raised_early_is_told_as_an_alarm_and_again_when_it_is_sure(failuretwin):
+    fault = ("--fault", "motor_3:stuck@12", "--seed", 2)
+    answer = failuretwin("watch", "emulated", "--speed", 0, "--seconds", 25, *fault)
+    assert answer.returncode == 0, answer.stderr
+    early, sure = [text for _, text in told(answer) if text.startswith("ALARM: ")]
+    assert "59 % (or healthy 41 %)" in early
+    assert early.endswith("alarm threshold 57 %, by --false-alarms-per-100h")
+    assert sure.startswith("ALARM: motor 3 stuck at -44 deg")
 
 
 def test_a_recorded_fault_and_its_repair_are_found(failuretwin, watched):
@@ -63,7 +73,7 @@ def test_a_recorded_fault_and_its_repair_are_found(failuretwin, watched):
     answer = failuretwin("watch", path, "--speed", 0)
     assert answer.returncode == 0, answer.stderr
     check_found(told(answer))
-    assert "last answer: healthy" in answer.stdout
+    assert "last answer: OK: healthy" in answer.stdout
     assert [text for _, text in told(answer)][-1:] == [text for _, text in told(live)][-1:]
 
 
@@ -78,7 +88,7 @@ def test_an_emulated_robot_has_a_fault_of_a_size_that_begins_at_a_time(failuretw
     fault = ("--fault", "motor_2:steady_state_error=0.1@20")
     answer = failuretwin("watch", "emulated", "--speed", 0, "--seconds", 40, *fault)
     assert answer.returncode == 0, answer.stderr
-    assert "last answer: motor 2 misses its targets by about 5.9 deg" in answer.stdout
+    assert "last answer: ALARM: motor 2 misses its targets by about 5.9 deg" in answer.stdout
 
 
 def test_a_robot_on_a_ros_network_is_watched(roscore):
@@ -114,7 +124,7 @@ def test_a_robot_on_a_ros_network_is_watched(roscore):
         peer.close()
     assert answer.returncode == 0, answer.stderr
     assert "motor_3:stuck" in said, wrong
-    assert any(text.startswith("motor 3 stuck") for _, text in told(answer))
+    assert any(text.startswith("ALARM: motor 3 stuck") for _, text in told(answer))
     assert len(messages) > 1
     motors = {s["name"]: s["level"] for s in messages[-1]["statuses"]}
     assert motors["failuretwin: motor_3"] == 2
@@ -143,6 +153,8 @@ def test_without_a_master_the_user_is_told_to_start_one(failuretwin, monkeypatch
         (("watch", "ros1", "--robot", "ur5e"), "file for --topics"),
         (("emulate", "--to", "robot.bag"), "rosbridge://HOST[:PORT] or a file that ends in .mcap"),
         (("emulate", "--to", "a.mcap", "--fault", "motor_3:stuck@soon"), "is not of the form"),
+        (("emulate", "--obey", "--to", "a.mcap"), "--obey needs a network"),
+        (("emulate", "--obey", "--speed", "2"), "stamped by clocks of speed 1, but --speed is 2"),
         (("emulate", "--to", "no/such/folder.mcap"), "cannot be written"),
         (("watch", "emulated", "--record", "live.bag"), "Give a name that ends in .mcap"),
         (("watch", ".", "--fault", "motor_3:stuck@5"), "--fault is of an"),

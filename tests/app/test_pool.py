@@ -54,7 +54,7 @@ def test_a_fleet_becomes_a_file_that_diagnoses(fleet, armpi, tmp_path):
     save_run_set(simulate(Plan(armpi, ["healthy"], 2, 3, expected)), logs)
     run("diagnose", logs, "--self-calibrate", "--calibration", out, "--out", found)
     learned = read_calibration(found, armpi).imperfections
-    assert (learned.protocol, "population of 3 robots" in learned.source) == ("P1", True)
+    assert (learned.protocol, learned.source.endswith("; fleet")) == ("P1", True)
 
 
 def test_the_name_can_be_chosen(fleet, armpi, tmp_path):
@@ -75,3 +75,5 @@ def test_what_cannot_be_pooled_leaves_no_file(fleet, tmp_path):
         with pytest.raises(click.UsageError, match="--pool reads no logs"):
             run("calibrate", "--pool", *fleet, "--out", out, *option)
     assert not out.exists()
+    with pytest.raises(InputError, match=r"robot_1\.toml: is one of the calibrations to pool"):
+        run("calibrate", "--pool", *fleet, "--out", fleet[0], "--name", "robot 1")

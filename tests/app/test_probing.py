@@ -376,7 +376,7 @@ def test_an_emulated_arm_is_watched_that_may_be_asked(failuretwin):
     pytest.importorskip("mujoco")
     answer = failuretwin("watch", "emulated", "--probe", 2, "--speed", 0, "--seconds", 8)
     assert answer.returncode == 0, answer.stderr
-    assert "last answer: healthy" in answer.stdout
+    assert "last answer: OK: healthy" in answer.stdout
 
 
 @pytest.mark.parametrize("source", [".", "recorded.mcap"])

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 
 from calibration_files import read_calibration
 from failuretwin.app.cli import cli
+from failuretwin.connection.calibration.result import save_calibration
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
@@ -128,6 +129,26 @@ def test_runs_of_two_robots_are_noticed_on_the_way(armpi, tmp_path):
     assert "two robots" not in one.output
     both = diagnose(tmp_path / "a.nc", tmp_path / "b.nc", "--track")
     assert "the runs seem to be of two robots" in both.output
+
+
+def test_the_calibration_of_another_robot_is_not_replaced(together, runs, armpi, tmp_path):
+    """One that healthy logs taught may be of any arm; it may be begun with, and the own renewed."""
+    path = tmp_path / "mine.toml"
+    learned = read_calibration(together[1] / "own.toml", armpi)
+    named = replace(learned, imperfections=replace(learned.imperfections, name="robot B"))
+    save_calibration(named, armpi, path)
+    before = path.read_bytes()
+    refusal = "holds calibration 'robot B' of robot 'armpi_fpv', expected 'armpi_fpv, self-calibra"
+    for how in ("--self-calibrate", "--track"):
+        with pytest.raises(OSError, match=refusal):
+            diagnose(runs, how, "--out", path)
+    assert path.read_bytes() == before
+    one = tmp_path / "one.nc"
+    save_run_set(load_run_set(runs).isel(run=[0]), one)
+    for begun in (("--calibration", path), ()):
+        assert diagnose(one, "--self-calibrate", *begun, "--out", path).exit_code == 0
+        name = read_calibration(path, armpi).imperfections.name
+        assert name == "armpi_fpv, self-calibrated"
 
 
 def test_without_it_nothing_is_learned(runs, tmp_path):

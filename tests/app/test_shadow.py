@@ -332,13 +332,27 @@ def test_what_changes_is_told_once(armpi):
     states += [(OK, HEALTHY, over)] * 3
     told = lines(changes, [moment(float(k), *state) for k, state in enumerate(states)])
     assert told == [
-        "healthy, 99 % sure",
-        "motor 3 stuck",
-        "no data any more",
+        "OK: healthy, 99 % sure",
+        "ALARM: motor 3 stuck",
+        "STALE: no data any more",
         "data are coming",
-        "healthy again, the alarm for motor 3 stuck stood 62 s: healthy, 99 % sure",
+        "CLEARED: the alarm for motor 3 stuck lasted 62 s; healthy, 99 % sure",
     ]
-    assert str(changes.lines[1]) == "     3.0 s  motor 3 stuck"
+    assert str(changes.lines[1]) == "     3.0 s  ALARM: motor 3 stuck"
+
+
+def test_an_alarm_that_is_not_sure_says_why_and_then_that_it_is_sure(armpi):
+    """A line for the alarm, with its threshold, and one when it becomes sure, once."""
+    unsure = Diagnosis("live", {"healthy": 0.41, CAUSE: 0.59}, verdict="cannot tell yet")
+    raised = Alarm(RAISED, CAUSE, LASTS, threshold=4.0 / 7.0)
+    states = [HEALTHY, unsure, unsure, STUCK, STUCK, unsure, STUCK]
+    moments = [moment(0.0, OK, states[0])]
+    moments += [moment(1.0 + k, OK, state, raised) for k, state in enumerate(states[1:])]
+    assert lines(Changes(armpi.motor_names), moments) == [
+        "OK: healthy, 99 % sure",
+        "ALARM: cannot tell yet; alarm threshold 57 %, by --false-alarms-per-100h",
+        "ALARM: motor 3 stuck",
+    ]
 
 
 def test_what_is_suspected_is_told_and_that_it_passed(armpi):
@@ -348,9 +362,9 @@ def test_what_is_suspected_is_told_and_that_it_passed(armpi):
     moments = [moment(0.0, OK, HEALTHY), moment(1.0, OK, unsure, suspected)]
     moments += [moment(2.0, OK, unsure, suspected), moment(3.0, OK, unsure)]
     assert lines(changes, moments) == [
-        "healthy, 99 % sure",
-        "suspected: motor 3 stuck, 40 %; healthy?",
-        "no longer suspected: healthy?",
+        "OK: healthy, 99 % sure",
+        "SUSPECTED: motor 3 stuck, 40 %; healthy?",
+        "CLEARED: motor 3 stuck is no longer suspected; healthy?",
     ]
 
 
@@ -359,8 +373,8 @@ def test_why_nothing_can_be_said_is_told_once(armpi):
     changes = Changes(armpi.motor_names)
     moments = [moment(float(k), OK, untold) for k in range(3)] + [moment(3.0, OK, HEALTHY)]
     assert lines(changes, moments) == [
-        "undecided: the tool moves though no command came",
-        "healthy, 99 % sure",
+        "UNDECIDED: the tool moves though no command came",
+        "OK: healthy, 99 % sure",
     ]
 
 
@@ -400,10 +414,10 @@ def test_a_reason_is_told_anew_only_where_it_is_another(armpi):
         for k, reason in enumerate([*reasons, "no motor is told to move"])
     ]
     assert lines(Changes(armpi.motor_names), [*moments, moment(9.0, OK, HEALTHY)]) == [
-        "healthy, 99 % sure",
-        f"undecided: {reasons[0]}",
-        "undecided: no motor is told to move",
-        "healthy, 99 % sure",
+        "OK: healthy, 99 % sure",
+        f"UNDECIDED: {reasons[0]}",
+        "UNDECIDED: no motor is told to move",
+        "OK: healthy, 99 % sure",
     ]
 
 
@@ -447,13 +461,22 @@ def test_the_view_shows_motors_posterior_and_changes(armpi):
     with console.capture() as captured:
         console.print(view.draw(told, LinkCounts(received=7), changes.lines))
     text = captured.get()
-    assert "ERROR" in text
+    assert "ALARM: motor 3 stuck" in text.splitlines()[0]
     assert "7 events, 0 garbage, 0 dropped" in text
-    assert "motor_3  ERROR   99.0 %" in text
+    assert "motor_3  ALARM   99.0 %" in text
     assert "motor_3:stuck" in text
-    assert "3.0 s  motor 3 stuck" in text
+    assert "3.0 s  ALARM: motor 3 stuck" in text
     stale = view.draw(moment(9.0, STALE, HEALTHY), LinkCounts(), changes.lines)
     with console.capture() as captured:
         console.print(stale)
     assert "no data for a while" in captured.get()
     assert "OK" not in captured.get()
+
+
+def test_a_terminal_and_a_pipe_show_the_same_lines(twin, capsys):
+    shown = StringIO()
+    for console in (Console(file=StringIO()), Console(file=shown, force_terminal=True, width=120)):
+        watch_until_end(Shadow(Script([reading(0.0)]), Notebook(), twin), console, np.inf)
+    line = "0.0 s  OK: healthy, 99 % sure"
+    assert line in capsys.readouterr().out
+    assert line in shown.getvalue()

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from failuretwin.app.commands.options import EMULATED, ArmOptions, LiveOptions
+from failuretwin.connection.links import NETWORKS
 from failuretwin.connection.links.base import Commander, Sink, Source, source_from_text
 from failuretwin.connection.links.replay import Pace
 from failuretwin.connection.links.ros_link import (
-    NETWORKS,
     RosCommander,
     RosSink,
     RosSource,
@@ -47,7 +47,7 @@ from failuretwin.inference.observation.healthy_model import HealthyModel
 if TYPE_CHECKING:
     from failuretwin.connection.emulated_arm import Emulation
 
-PLACES = f"{EMULATED}, {NETWORKS}"
+PLACES = ", ".join((EMULATED, *NETWORKS))
 SOURCES = f"{PLACES}, a log (raw session, bag, .mcap), or a source of your own, MODULE:CLASS"
 OWN_CLASS = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(:.*)?")
 """Name of a source class of the user, see `source_from_text`."""

@@ -13,10 +13,10 @@ from failuretwin.app.commands.options import LiveOptions
 from failuretwin.app.terminal import tell, until_interrupted
 from failuretwin.connection.commanded_arm import CommandedArm
 from failuretwin.connection.emulated_arm import Emulation, emulated
+from failuretwin.connection.links import NETWORKS
 from failuretwin.connection.links.base import CommandSent, Order, Reading, Sink
 from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace
 from failuretwin.connection.links.ros_link import (
-    NETWORKS,
     RosSink,
     RosSource,
     is_network,
@@ -38,11 +38,17 @@ def obey(target: str, emulation: Emulation, live: LiveOptions) -> None:
     """Publish readings and carry out the commands of a network, until interrupted.
 
     Raises:
-        InputError: If the target is no network, or cannot be reached.
+        InputError: If the target is no network, or cannot be reached, or time passes at another
+            speed than that of the programs that stamp the commands.
     """
     if not is_network(target):
         raise InputError(f"--obey needs a network to obey, but --to is {target!r}.")
-    topics, arm = load_topics(live.topics), CommandedArm(emulation, Pace(live.speed))
+    if live.speed != 1.0:
+        raise InputError(
+            f"--obey takes commands that are stamped by clocks of speed 1, but --speed is "
+            f"{live.speed:g}: stamps would not fit the movements. Leave out --speed."
+        )
+    topics, arm = load_topics(live.topics), CommandedArm(emulation, Pace())
     with open_transport(target) as transport, until_interrupted():
         sink = RosSink(RosWriter(emulation.robot, topics), transport)
         orders = RosSource(emulation.robot, topics, transport)
@@ -66,7 +72,8 @@ def play(target: str, emulation: Emulation, live: LiveOptions) -> None:
     """
     zero, on_network = time.time(), is_network(target)
     if not on_network and Path(target).suffix != ".mcap":
-        raise InputError(f"--to is {target!r}, expected {NETWORKS} or a file that ends in .mcap.")
+        places = ", ".join(NETWORKS)
+        raise InputError(f"--to is {target!r}, expected {places} or a file that ends in .mcap.")
     length = live.seconds or (math.inf if on_network else _file_length(emulation.schedule))
     pace = Pace(live.speed if on_network else AS_FAST_AS_POSSIBLE)
     source, state, trouble = emulated(emulation, pace, length, zero), "", ""

@@ -12,7 +12,7 @@ from failuretwin.app.reports.technician_page import Section
 from failuretwin.app.terminal import progress_bar
 from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
 from failuretwin.connection.life_history import History, keep_history, open_history
-from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
+from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser, learned_name
 from failuretwin.connection.tracked_diagnosis import begin, calibration_of, diagnose_tracked
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis
@@ -72,7 +72,9 @@ def self_calibrated(
     """
     robot = bayes.twin.robot
     if out is not None:
-        check_calibration_file(out)
+        begun = calibration is not None and calibration.resolve() == out.resolve()
+        given = bayes.healthy_model.imperfections.name
+        check_calibration_file(out, robot, given if begun else learned_name(robot))
     together = SelfCalibratingDiagnoser(robot, calibration, bayes.hypotheses, bayes.priors)
     with progress_bar("self-calibrating", PASSES) as advance:
         learned = together.learn(runs, advance)
@@ -101,7 +103,8 @@ def opened_history(bayes: BayesDiagnoser, calibration: Path | None, out: Path | 
             "--out, or --calibration to begin with the arm class."
         )
     if out is not None:
-        check_calibration_file(out)
+        robot = bayes.twin.robot
+        check_calibration_file(out, robot, learned_name(robot))
     start, beside = begin(bayes, uncalibrated), out if uncalibrated else calibration
     if beside is None:
         return History(start, uncalibrated)

@@ -22,7 +22,6 @@ from failuretwin.app.terminal import tell
 from failuretwin.connection.links.base import Event, LinkCounts
 from failuretwin.connection.links.statuses import (
     LEVEL_ERROR,
-    LEVEL_NAMES,
     LEVEL_OK,
     LEVEL_STALE,
     LEVEL_WARN,
@@ -227,7 +226,7 @@ class View:
 
     def _head(self, snapshot: Snapshot, counts: LinkCounts) -> Text:
         arm = statuses(snapshot.answer, self._motors)[0]
-        head = Text(f"{LEVEL_NAMES[arm.level]:6s}", STYLES[arm.level])
+        head = Text(f"{arm.state}:", STYLES[arm.level])
         head.append(f" {printable(arm.message)}\n", "default")
         off = float(np.linalg.norm(snapshot.residual)) * 1000.0
         share = 0.0 if np.isnan(off) else min(1.0, off / RESIDUAL_MM)
@@ -249,7 +248,7 @@ class View:
             probability = float(status.values.get("probability", 0.0))
             table.add_row(
                 printable(status.name),
-                Text(LEVEL_NAMES[status.level], STYLES[status.level]),
+                Text(status.state, STYLES[status.level]),
                 f"{100 * probability:5.1f} %" if status.values else "",
                 _bar(probability),
                 printable(status.message),

@@ -21,9 +21,9 @@ from failuretwin.connection.links.base import (
     Sink,
     Source,
 )
-from failuretwin.connection.links.statuses import statuses
+from failuretwin.connection.links.statuses import UNDECIDED, is_sure, statuses
 from failuretwin.connection.links.stream_time import LiveReference, ReorderBuffer, StreamClock
-from failuretwin.core.hypothesis import RAISED, SUSPECTED, Alarm, Episode, Hypothesis
+from failuretwin.core.hypothesis import CLEAR, RAISED, SUSPECTED, Alarm, Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
 from failuretwin.decision.streaming.monitor import FaultMonitor
@@ -215,12 +215,13 @@ class _NowAndThen:
         return True
 
 
-def _over(episode: Episode | None) -> str:
-    """Return the end of a fault and the length of its alarm in words."""
-    if episode is None or episode.duration_s is None:
-        return "healthy again"
-    cause = plain_name(Hypothesis.parse(episode.cause))
-    return f"healthy again, the alarm for {cause} stood {episode.duration_s:.0f} s"
+def _cleared(before: Alarm, now: Alarm) -> str:
+    """Return what has ended in words: an alarm with its duration, or a suspicion."""
+    cause = plain_name(Hypothesis.parse(before.cause))
+    episode = now.episode
+    if before.state == SUSPECTED or episode is None or episode.duration_s is None:
+        return f"CLEARED: {cause} is no longer suspected"
+    return f"CLEARED: the alarm for {cause} lasted {episode.duration_s:.0f} s"
 
 
 @dataclass(frozen=True)
@@ -242,6 +243,7 @@ class Changes:
         self.lines: deque[Change] = deque(maxlen=KEPT)
         self._motors = motors
         self._alarm: Alarm | None = None
+        self._sure = False
         self._undecided = ""
         self._state = ""
         self._troubles: tuple[str, ...] = ()
@@ -270,7 +272,7 @@ class Changes:
         before, self._state = self._state, snapshot.answer.state
         if not before or before == self._state:
             return []
-        return ["no data any more" if self._state == STALE else "data are coming"]
+        return [f"{STALE}: no data any more" if self._state == STALE else "data are coming"]
 
     def _diagnosis(self, snapshot: Snapshot) -> list[str]:
         answer = snapshot.answer
@@ -279,20 +281,18 @@ class Changes:
         undecided, self._undecided = self._undecided, answer.diagnosis.undecided
         if self._undecided:
             same = FIGURE.sub("", self._undecided) == FIGURE.sub("", undecided)
-            return [] if same else [f"undecided: {self._undecided}"]
-        before, self._alarm = self._alarm, answer.alarm
-        same = before is not None and (before.state, before.cause) == (
-            self._alarm.state,
-            self._alarm.cause,
-        )
-        if same and not undecided:
+            return [] if same else [f"{UNDECIDED}: {self._undecided}"]
+        before, now = self._alarm, answer.alarm
+        same = before is not None and (before.state, before.cause) == (now.state, now.cause)
+        sure = now.state == RAISED and is_sure(answer.diagnosis)
+        told = same and not undecided and self._sure >= sure
+        self._alarm, self._sure = now, sure or (same and self._sure)
+        if told:
             return []
-        message = statuses(answer, self._motors)[0].message
-        if same or before is None or self._alarm.state in (SUSPECTED, RAISED):
-            return [message]
-        if before.state == SUSPECTED:
-            return [f"no longer suspected: {message}"]
-        return [f"{_over(self._alarm.episode)}: {message}"]
+        arm = statuses(answer, self._motors)[0]
+        if before is None or same or now.state != CLEAR:
+            return [str(arm)]
+        return [f"{_cleared(before, now)}; {arm.message}"]
 
     def _link(
         self, at: float, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]

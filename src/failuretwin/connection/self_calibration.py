@@ -190,12 +190,13 @@ class SelfCalibratingDiagnoser:
         return replace(known, lost_commands=tuple(map(more_when_late, known.lost_commands)))
 
 
-def _name(robot: Robot) -> str:
+def learned_name(robot: Robot) -> str:
+    """Return the name of a calibration that a robot's own runs teach."""
     return f"{robot.name}, self-calibrated"
 
 
 def _method(robot: Robot) -> str:
-    return f"bayes, settled poses; healthy behaviour: {_name(robot)}"
+    return f"bayes, settled poses; healthy behaviour: {learned_name(robot)}"
 
 
 def check_moves(movements: Movements) -> None:
@@ -246,7 +247,7 @@ def as_calibration(
     return Calibration(
         imperfections=replace(
             learned,
-            name=_name(robot),
+            name=learned_name(robot),
             source=source,
             protocol="P1",
             readings=readings_of(runs, robot, None),

@@ -314,11 +314,13 @@ class Alarm:
         state: `CLEAR`, `SUSPECTED` or `RAISED`.
         cause: The most probable fault; empty if the state is `CLEAR`.
         episode: The latest fault with an alarm; None before the first.
+        threshold: Probability of a fault from which this alarm was raised; None: no alarm.
     """
 
     state: str = CLEAR
     cause: str = ""
     episode: Episode | None = None
+    threshold: float | None = None
 
     def concerns(self, motor: str) -> bool:
         """Return whether its cause includes a motor."""

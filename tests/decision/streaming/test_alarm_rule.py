@@ -34,6 +34,7 @@ def test_states_from_clear_over_suspected_to_an_alarm_and_back():
     raised, over = told[2].episode, told[4].episode
     assert (raised.number, raised.cause, raised.raised_s) == (1, "motor_1:stuck", 2.0)
     assert (raised.cleared_s, raised.duration_s) == (None, None)
+    assert [alarm.threshold for alarm in told[1:4]] == [None, *[pytest.approx(4.0 / 7.0)] * 2]
     assert (over.number, over.cleared_s, over.duration_s) == (1, 4.0, 2.0)
     assert told[3].concerns("motor_1")
     assert not told[3].concerns("motor_2")

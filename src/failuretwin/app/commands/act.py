@@ -10,6 +10,7 @@ import click
 
 from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import show, tell, write_json
+from failuretwin.connection.links import NETWORKS, ROS1
 from failuretwin.core.errors import InputError
 
 
@@ -79,7 +80,7 @@ def act(
 
 
 @click.command()
-@opt.place_option("ros1")
+@opt.place_option(ROS1)
 @opt.topics_option
 @opt.robot_options
 def stop(place: str, topics: Path | None, robot: opt.RobotOptions) -> None:
@@ -95,9 +96,7 @@ def stop(place: str, topics: Path | None, robot: opt.RobotOptions) -> None:
     from failuretwin.decision.acting.work import where_it_stands
 
     if place == opt.EMULATED:
-        raise InputError(
-            "an emulated arm ends with its process. Name ros1, ros2 or rosbridge://HOST."
-        )
+        raise InputError(f"an emulated arm ends with its process. Name {', '.join(NETWORKS)}.")
     with ExitStack() as stack:
         arm = commander_of(opt.ArmOptions(place, (), True, topics), robot.known, robot.seed, stack)
         target = where_it_stands(arm)
@@ -114,15 +113,13 @@ def stop(place: str, topics: Path | None, robot: opt.RobotOptions) -> None:
     "all over its travel.",
 )
 @opt.space_options
-@opt.report_option("Draw a map of the workspace there, reach.png.")
-@opt.json_option("Write all points.")
+@opt.output_options("Write all points.", "Draw a map of the workspace there, reach.png.")
 @opt.robot_options
 def reach(
     task: Path | None,
     fault: str | None,
     safety: opt.SafetyOptions,
-    report: Path | None,
-    json_file: Path | None,
+    output: opt.OutputOptions,
     robot: opt.RobotOptions,
 ) -> None:
     """Report what an arm can still reach: of TASK.csv, or of its usual workspace.
@@ -135,6 +132,7 @@ def reach(
     from failuretwin.decision.acting.reach import reach_by_motor, workspace
     from failuretwin.decision.acting.task import read_task
 
+    output.check()
     model, seed = robot.model, robot.seed
     gate = safety.gate(model)
     points = workspace(model, seed=seed) if task is None else read_task(task)
@@ -146,6 +144,6 @@ def reach(
         maps = [reach_of(gate, points, held_of(fault, model), seed)]
         parts, records = map_parts(maps[0], per_point=task is not None), [maps[0].record()]
     show(*parts)
-    write_json(records, json_file)
-    if report is not None:
-        save_map(maps, report)
+    write_json(records, output.json_file)
+    if output.report is not None:
+        save_map(maps, output.report)

@@ -44,6 +44,7 @@ motion_options = opt.gathered(
         "--seconds",
         type=click.FloatRange(min=0.0, max=3600.0, min_open=True),
         default=20.0,
+        metavar="SECONDS",
         help="Time for the movements.",
     ),
     opt.hypotheses_option(
@@ -70,9 +71,9 @@ write_option = opt.file_option(
 
 DESIGN = ("seconds", "usual", "rest")
 """Options of the design of motions."""
-ARM = ("place", "faults", "move", "topics", "further")
+ARM = (*opt.names_of(opt.ArmOptions), "further")
 """Options of the arm that is moved."""
-MOTIONS = ("written", "motions", "keep", "speed_share", "floor", "radius")
+MOTIONS = ("written", "motions", "keep", *opt.names_of(opt.SafetyOptions))
 """Options of the motions that are made."""
 
 
@@ -100,8 +101,10 @@ MOTIONS = ("written", "motions", "keep", "speed_share", "floor", "radius")
 @opt.count_option(
     "--further", 0, "Maximum number of further movements if the result is still open."
 )
-@opt.json_option("Write one object a line.")
-@opt.report_option("Write index.html: the state of the robot, which motor, how surely, what to do.")
+@opt.output_options(
+    "Write one object a line.",
+    "Write index.html: the state of the robot, which motor, how surely, what to do.",
+)
 @opt.arm_options
 @motion_options
 @opt.safety_options
@@ -113,8 +116,7 @@ def check(
     motions: Path | None,
     keep: Path | None,
     further: int,
-    json_file: Path | None,
-    report: Path | None,
+    output: opt.OutputOptions,
     arm: opt.ArmOptions,
     motion: MotionOptions,
     safety: opt.SafetyOptions,
@@ -129,11 +131,11 @@ def check(
 
     _refuse_unused(logs, written, motions, keep)
     before = reports.kept_checks(keep) if keep is not None and keep.exists() else []
-    _check_outputs(keep, json_file, report)
+    output.check(keep)
     checking = motion.checking(safety, robot)
     model = checking.known.robot
     if logs:
-        _report_logs(checking.of_logs(logs), checking, json_file, report)
+        _report_logs(checking.of_logs(logs), checking, output)
         return
     planned = checking.motions(motion.seconds, keep if before else motions)
     if written is not None or not is_moved(arm):
@@ -151,9 +153,9 @@ def check(
     if keep is not None:
         reports.keep_check(keep, planned, [*before, record])
         show(*(reports.changes(before[-1], record) if before else [f"kept in {keep}"]))
-    write_json([record], json_file)
-    if report is not None:
-        reports.write_check_page([result], model, report)
+    write_json([record], output.json_file)
+    if output.report is not None:
+        reports.write_check_page([result], model, output.report)
     show(*reports.closing_lines(result, model))
 
 
@@ -173,18 +175,8 @@ def _refuse_unused(
         opt.refuse_unused(why, "motions", *DESIGN)
 
 
-def _check_outputs(keep: Path | None, json_file: Path | None, report: Path | None) -> None:
-    """Raise OutputError unless all outputs can be written, before anything moves."""
-    from failuretwin.data_knowledge.store import check_fillable, check_writable
-
-    for path in filter(None, (keep, json_file)):
-        check_writable(path)
-    if report is not None:
-        check_fillable(report)
-
-
 def _report_logs(
-    results: Sequence[CheckResult], checking: Checking, json_file: Path | None, report: Path | None
+    results: Sequence[CheckResult], checking: Checking, output: opt.OutputOptions
 ) -> None:
     """Report the results of checks that were recorded elsewhere."""
     from failuretwin.app.reports import check_report as reports
@@ -193,9 +185,9 @@ def _report_logs(
     for result in results:
         lines = reports.check_lines(result, model, 0.0)
         show(result.diagnosis.run, *lines, *reports.closing_lines(result, model), "")
-    write_json([reports.check_record(r, model, 0.0) for r in results], json_file)
-    if report is not None:
-        reports.write_check_page(results, model, report)
+    write_json([reports.check_record(r, model, 0.0) for r in results], output.json_file)
+    if output.report is not None:
+        reports.write_check_page(results, model, output.report)
 
 
 @click.command()
@@ -235,20 +227,19 @@ def design(
     "Default: the usual random movements.",
 )
 @opt.hypotheses_option("Hypotheses to compare. Default: the paper's nine classes.")
-@opt.report_option("Draw the smallest sizes there, isolability.png.")
-@opt.json_option("Write the table.")
+@opt.output_options("Write the table.", "Draw the smallest sizes there, isolability.png.")
 @opt.plugin_option
 @opt.calibrated_robot_options()
 def isolability(
     motions: Path | None,
     hypotheses: str | None,
-    report: Path | None,
-    json_file: Path | None,
+    output: opt.OutputOptions,
     robot: opt.RobotOptions,
 ) -> None:
     """Report the smallest fault of each motor and mode that motions of a robot can show."""
     from failuretwin.app.reports import isolability_report as reports
 
+    output.check()
     checking = MotionOptions(hypotheses).checking(opt.SafetyOptions(), robot)
     model = checking.known.robot
     found = (
@@ -257,6 +248,6 @@ def isolability(
         else checking.isolability_in(motions)
     )
     show(reports.size_table(found, model), *reports.group_lines(found, model))
-    write_json(reports.isolability_records(found), json_file)
-    if report is not None:
-        reports.save_picture(found, model, report)
+    write_json(reports.isolability_records(found), output.json_file)
+    if output.report is not None:
+        reports.save_picture(found, model, output.report)

@@ -9,7 +9,6 @@ import click
 import failuretwin as ft
 from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import show
-from failuretwin.core.errors import InputError
 
 
 @click.command()
@@ -43,11 +42,11 @@ def evaluate(
     from failuretwin.decision.evaluation import Truths
 
     truths = None
-    if truth is not None:
-        runs = ft.read_runs(truth, robot.robot, ft.ReadOptions(published_labels=published_labels))
-        truths = Truths.of(runs, str(truth))
-    elif published_labels:
-        raise InputError("--published-labels says how to read the truth. Add --truth RUNS.")
+    if truth is None:
+        opt.refuse_unused("no runs with the truth are given", "published_labels")
+    else:
+        options = ft.ReadOptions(published_labels=published_labels)
+        truths = Truths.of(ft.read_runs(truth, robot.robot, options), str(truth))
     first = ft.read_results(results)
     scores = ft.evaluate(first, truths, np.random.default_rng(robot.seed))
     comparison = None

@@ -56,7 +56,8 @@ def calibrate(
     from failuretwin.connection.calibration import step_parameters
     from failuretwin.connection.calibration.result import check_calibration_file
 
-    check_calibration_file(out)
+    name = name or out.stem
+    check_calibration_file(out, robot.model, name)
     if pool:
         if hold_out is not None or report is not None:
             raise click.UsageError("--pool reads no logs. Leave out --hold-out and --report.")
@@ -69,7 +70,7 @@ def calibrate(
     source = ", ".join(map(str, reading.logs))
     wrong = _wrong_set_up(runs, model)
     try:
-        found = ft.calibrate(runs, model, name or out.stem, source, hold_out)
+        found = ft.calibrate(runs, model, name, source, hold_out)
     except InputError as error:
         if not wrong:
             raise
@@ -104,15 +105,15 @@ def _wrong_set_up(runs: xr.Dataset, robot: ft.Robot) -> str:
     return f"{said}; what is learned of such logs is not the robot.{right}"
 
 
-def _pool(
-    calibrations: tuple[Path, ...], out: Path, name: str | None, robot: opt.RobotOptions
-) -> None:
+def _pool(calibrations: tuple[Path, ...], out: Path, name: str, robot: opt.RobotOptions) -> None:
     """Write the population that some calibrated robots come from."""
     from failuretwin.app.reports.calibration_report import population_parts
 
+    if out.resolve() in [path.resolve() for path in calibrations]:
+        raise InputError(f"{out}: is one of the calibrations to pool. Choose another --out.")
     population = ft.Population.fit(calibrations, robot.model)
     figures = population.imperfections
-    population = replace(population, imperfections=replace(figures, name=name or figures.name))
+    population = replace(population, imperfections=replace(figures, name=name))
     ft.save_calibration(population.calibration, robot.model, out)
     show(*population_parts(population.calibration, robot.model))
     tell(f"written to {out}")
@@ -179,9 +180,7 @@ def train(
 @click.command()
 @opt.file_option("--out", "DIR", "Folder for everything.", required=True)
 @opt.file_option(
-    "--test test_path",
-    "PATH",
-    "Real runs to test on. Default: runs of the physics engine, as a stand-in.",
+    "--test", "PATH", "Real runs to test on. Default: runs of the physics engine, as a stand-in."
 )
 @opt.published_labels_option
 @opt.flag_option("--quick", "A small version of about two minutes.")
@@ -189,7 +188,7 @@ def train(
 @opt.robot_options
 def study(
     out: Path,
-    test_path: Path | None,
+    test: Path | None,
     published_labels: bool,
     quick: bool,
     resume: bool,
@@ -205,22 +204,22 @@ def study(
     from failuretwin.app.reports.study_page import write_study_page
     from failuretwin.decision.learned import paper_study as paper
 
-    if published_labels and test_path is None:
-        raise InputError("--published-labels says how to read a test set. Add --test PATH.")
+    if test is None:
+        opt.refuse_unused("no real runs are given", "published_labels")
     model, seed = robot.model, robot.seed
     plan = paper.quick_plan(seed) if quick else paper.StudyPlan(seed)
     paper.check_folder(out, resume)
     figure_class()  # better told before the work than after it
-    test = (
+    exam = (
         paper.stand_in_test_set(plan, model)
-        if test_path is None
-        else paper.given_test_set(test_path, model, published_labels)
+        if test is None
+        else paper.given_test_set(test, model, published_labels)
     )
     check_learning()
     jobs = len(plan.jobs())
     tell(f"{jobs} trainings of {plan.iterations} iterations each")
     with progress_bar("training", jobs) as advance:
-        trainings = paper.run_study(plan, model, test, out, advance)
+        trainings = paper.run_study(plan, model, exam, out, advance)
     page = out / paper.PAGE
-    write_study_page(trainings, plan, model, test, page)
+    write_study_page(trainings, plan, model, exam, page)
     tell(f"written to {page}")

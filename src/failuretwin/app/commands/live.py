@@ -11,12 +11,14 @@ import click
 
 from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import console, tell, until_interrupted
+from failuretwin.connection.links import NETWORKS, ROS1
+from failuretwin.decision.streaming import STREAMED
 
 if TYPE_CHECKING:
     from failuretwin.connection.links.base import Commander
 
 
-PROBING = ("idle", "move", "speed_share", "floor", "radius")
+PROBING = ("idle", "move", *opt.names_of(opt.SafetyOptions))
 """Options of `watch` for its movements of the arm."""
 
 
@@ -37,8 +39,8 @@ PROBING = ("idle", "move", "speed_share", "floor", "radius")
 )
 @click.option(
     "--sensing",
-    type=click.Choice(["tool", "tool+encoders", "tool+goals", "tool+encoders+goals"]),
-    default="tool",
+    type=click.Choice(STREAMED),
+    default=STREAMED[0],
     help="Sensors to use. tool: its position. encoders: joint angles that the motors report, such "
     "as /joint_states; errors show sooner, but a wrong reading is taken for the motor. goals: the "
     "goals that they report to have received; a stuck motor shows sooner.",
@@ -103,16 +105,16 @@ def watch(
             watch_until_end(shadow, console(), time.monotonic() + length, prober)
     arm = statuses(shadow.snapshot.answer, model.motor_names)[0]
     tell(fit_of(diagnoser))
-    tell(f"last answer: {arm.message}")
+    tell(f"last answer: {arm}")
 
 
 @click.command()
 @click.option(
     "--to",
     "target",
-    default="ros1",
-    metavar="ros1|ros2|FILE.mcap",
-    help="Publish as a ROS 1 node, or on ROS 2 over Zenoh, until interrupted, or write a recording "
+    default=ROS1,
+    metavar="|".join((*NETWORKS, "FILE.mcap")),
+    help="Publish on a network, ROS 2 over Zenoh, until interrupted, or write a recording "
     "at once: one minute, or until 20 s after the last fault has begun or been repaired, unless "
     "--seconds says otherwise.",
 )

@@ -12,6 +12,7 @@ import click
 from click.core import ParameterSource
 
 import failuretwin as ft
+from failuretwin.connection.links import NETWORKS
 from failuretwin.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -45,14 +46,18 @@ def flag_option(flag: str, text: str) -> Callable[[F], F]:
     return click.option(flag, is_flag=True, help=text)
 
 
+def names_of(kind: type) -> tuple[str, ...]:
+    """Return the names of the parameters that a group of options has."""
+    return tuple(field.name for field in fields(kind))
+
+
 def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F], F]:
     """Return a decorator that adds options; the command gets them as one argument, of `kind`."""
 
     def decorate(command: F) -> F:
         @wraps(command)
         def with_one(**told: Any) -> Any:
-            names = [field.name for field in fields(kind) if field.name in told]
-            own = {option: told.pop(option) for option in names}
+            own = {option: told.pop(option) for option in names_of(kind) if option in told}
             return command(**told, **{name: kind(**own)})
 
         decorated: Any = with_one
@@ -128,7 +133,7 @@ def calibrated_robot_options(default: str | None = None) -> Callable[[F], F]:
 
 def report_option(text: str) -> Callable[[F], F]:
     """Return the option `--report DIR`."""
-    return click.option("--report", type=PATH, metavar="DIR", help=text)
+    return file_option("--report", "DIR", text)
 
 
 class HypothesesOption(click.Option):
@@ -171,7 +176,29 @@ def plugin_option(command: F) -> F:
 
 def json_option(text: str) -> Callable[[F], F]:
     """Return the option `--json FILE`."""
-    return click.option("--json", "json_file", type=PATH, metavar="FILE", help=text)
+    return file_option("--json json_file", "FILE", text)
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """Values of `output_options`: where results go."""
+
+    json_file: Path | None
+    report: Path | None
+
+    def check(self, *others: Path | None) -> None:
+        """Raise OutputError unless these and other files can be written: ask before any work."""
+        from failuretwin.data_knowledge.store import check_fillable, check_writable
+
+        for path in filter(None, (self.json_file, *others)):
+            check_writable(path)
+        if self.report is not None:
+            check_fillable(self.report)
+
+
+def output_options(json_text: str, report_text: str) -> Callable[[F], F]:
+    """Return the options `--json FILE` and `--report DIR`."""
+    return gathered(OutputOptions, "output", json_option(json_text), report_option(report_text))
 
 
 published_labels_option = flag_option(
@@ -179,6 +206,7 @@ published_labels_option = flag_option(
     "Take the truth of raw sessions from folder names that end in _label_K and freeze the "
     "motor of labels 1-4 from sample 49 on, as the authors of the data did.",
 )
+
 topics_option = file_option(
     "--topics",
     "FILE.toml",
@@ -289,8 +317,8 @@ def move_option(when: str = "") -> Callable[[F], F]:
 
 def place_option(default: str) -> Callable[[F], F]:
     """Return the option `--on`, the arm that takes orders: emulated by default, or a real one."""
-    kinds = f"{EMULATED}|" * (default == EMULATED) + "ros1|ros2|rosbridge://HOST[:PORT]"
-    return click.option("--on", "place", default=default, metavar=kinds, help="The arm.")
+    kinds = ((EMULATED,) if default == EMULATED else ()) + NETWORKS
+    return click.option("--on", "place", default=default, metavar="|".join(kinds), help="The arm.")
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,8 @@ def calibration_parts(found: Calibration, robot: Robot) -> list[Part]:
 
 def population_parts(found: Calibration, robot: Robot) -> list[Part]:
     """Return the mean and spread of a fleet's parameters."""
-    head = f"{robot.name}: {found.imperfections.name}: {', '.join(found.sessions)}\n"
+    fleet = found.sessions
+    head = f"{robot.name}: population of {len(fleet)} robots: {', '.join(fleet)}\n"
     return [head, parameter_table(found.parameters, robot, "95 % of such robots")]
 
 

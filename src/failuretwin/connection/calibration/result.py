@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from failuretwin import __version__
-from failuretwin.core.errors import InputError
+from failuretwin.core.config import read_toml
+from failuretwin.core.errors import InputError, OutputError
 from failuretwin.data_knowledge.store import check_writable, write_text
 from failuretwin.digital_model.calibrated_robot import (
     CALIBRATION_TABLE,
@@ -205,11 +206,25 @@ def save_calibration(calibration: Calibration, robot: Robot, path: str | Path) -
     write_text(text, Path(path))
 
 
-def check_calibration_file(path: Path) -> None:
-    """Raise an error unless a calibration can be written to `path`: worth asking before work."""
+def check_calibration_file(path: Path, robot: Robot, name: str) -> None:
+    """Raise an error unless a calibration can be written to `path`: worth asking before work.
+
+    It only replaces a calibration of the same robot that has the same name.
+    """
     if path.suffix != ".toml":
         raise InputError(f"{path}: a calibration ends in .toml.")
     check_writable(path)
+    if not path.exists():
+        return
+    table = read_toml(path)
+    record = table.get(CALIBRATION_TABLE, {})
+    of = record.get("robot", "") if isinstance(record, dict) else ""
+    if of not in ("", robot.name) or table.get("name") != name:
+        raise OutputError(
+            f"{path}: holds calibration {table.get('name', '')!r} of robot {of!r}, expected "
+            f"{name!r} of {robot.name!r}, or no file. Choose another --out; if it is the same "
+            "robot, remove the file first."
+        )
 
 
 def _plain(value: Any) -> Any:

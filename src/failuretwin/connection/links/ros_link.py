@@ -1,7 +1,4 @@
-"""Links to a robot on a ROS network, over any transport: source, commander and sinks.
-
-Networks are named as on the command line: ``ros1``, ``ros2``, ``rosbridge://HOST``.
-"""
+"""Links to a robot on a ROS network, over any transport: source, commander and sinks."""
 
 from __future__ import annotations
 
@@ -10,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from urllib.parse import urlsplit
 
+from failuretwin.connection.links import ROS1, ROS2, ROSBRIDGE
 from failuretwin.connection.links.base import (
     CommandSent,
     Event,
@@ -29,10 +27,6 @@ from failuretwin.connection.links.rosbridge import BRIDGE_PORT, RosbridgeTranspo
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot
-
-ROS1, ROS2, ROSBRIDGE = "ros1", "ros2", "rosbridge"
-NETWORKS = f"{ROS1}, {ROS2}[://HOST[:PORT]], {ROSBRIDGE}://HOST[:PORT]"
-"""Names of networks, for messages to the user."""
 
 
 def is_network(text: str) -> bool:

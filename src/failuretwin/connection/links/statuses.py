@@ -7,14 +7,32 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.connection.links.base import STALE, Answer
-from failuretwin.core.hypothesis import CLEAR, RAISED, SUSPECTED, Alarm, Diagnosis, Hypothesis
+from failuretwin.connection.links.base import OK, STALE, Answer
+from failuretwin.core.hypothesis import (
+    CLEAR,
+    FAULTY_STATE,
+    RAISED,
+    SURE,
+    SUSPECTED,
+    Alarm,
+    Diagnosis,
+    Hypothesis,
+)
 from failuretwin.inference.explanation import percent, plain_name
 
 LEVEL_OK, LEVEL_WARN, LEVEL_ERROR, LEVEL_STALE = range(4)
 """Levels of ``diagnostic_msgs/DiagnosticStatus``."""
-LEVEL_NAMES = ("OK", "WARN", "ERROR", "STALE")
-LEVELS = {CLEAR: LEVEL_OK, SUSPECTED: LEVEL_WARN, RAISED: LEVEL_ERROR}
+STATES = {CLEAR: "OK", SUSPECTED: "SUSPECTED", RAISED: "ALARM"}
+"""Word for each state of an alarm."""
+UNDECIDED = "UNDECIDED"
+LEVELS = {
+    "OK": LEVEL_OK,
+    "SUSPECTED": LEVEL_WARN,
+    UNDECIDED: LEVEL_WARN,
+    "ALARM": LEVEL_ERROR,
+    STALE: LEVEL_STALE,
+}
+"""Level of each state."""
 
 
 @dataclass(frozen=True)
@@ -23,21 +41,30 @@ class Status:
 
     Attributes:
         name: ``arm``, or the name of the motor.
-        level: One of the four levels.
+        state: One of `LEVELS`.
         message: Description in words.
         values: Key-values: probability, mode, magnitude, onset, runner-up.
     """
 
     name: str
-    level: int
+    state: str
     message: str
     values: Mapping[str, str]
+
+    def __str__(self) -> str:
+        """Return state and description as a line."""
+        return f"{self.state}: {self.message}"
+
+    @property
+    def level(self) -> int:
+        """Level of the state."""
+        return LEVELS[self.state]
 
 
 def statuses(answer: Answer, motors: Sequence[str]) -> list[Status]:
     """Return the statuses of an answer: the arm first, then its motors.
 
-    The alarm decides the levels, whatever the probabilities are. Without data every status is
+    The alarm decides the states, whatever the probabilities are. Without data every status is
     stale, with the last known state in its message.
 
     Args:
@@ -48,19 +75,25 @@ def statuses(answer: Answer, motors: Sequence[str]) -> list[Status]:
     diagnosis = answer.diagnosis
     if diagnosis is None:
         text = "no data have come yet" if answer.state == STALE else "nothing can be said yet"
-        return [Status(name, LEVEL_STALE, text, {}) for name in names]
+        return [Status(name, STALE, text, {}) for name in names]
     alarm = answer.alarm
     if diagnosis.undecided:
-        current = [
-            Status(name, max(LEVEL_WARN, _level(alarm, name)), diagnosis.verdict, {})
-            for name in names
-        ]
+        raised = [name for name in names if alarm.state == RAISED and _concerns(alarm, name)]
+        words = {name: STATES[RAISED] if name in raised else UNDECIDED for name in names}
+        current = [Status(name, word, diagnosis.verdict, {}) for name, word in words.items()]
     else:
         current = [_arm(diagnosis, alarm), *(_motor(diagnosis, alarm, motor) for motor in motors)]
     if answer.state != STALE:
         return current
     before = "no data for a while; before that: "
-    return [Status(s.name, LEVEL_STALE, before + s.message, s.values) for s in current]
+    return [Status(s.name, STALE, before + s.message, s.values) for s in current]
+
+
+def is_sure(diagnosis: Diagnosis) -> bool:
+    """Return whether a fault, or a faulty motor, has 95 %."""
+    best = diagnosis.ranked[0]
+    one = best != "healthy" and diagnosis.posterior[best] >= SURE
+    return one or diagnosis.state == FAULTY_STATE
 
 
 def _arm(diagnosis: Diagnosis, alarm: Alarm) -> Status:
@@ -76,10 +109,10 @@ def _arm(diagnosis: Diagnosis, alarm: Alarm) -> Status:
     if alarm.cause and alarm.cause != best:
         share = diagnosis.posterior.get(alarm.cause, 0.0)
         what = plain_name(Hypothesis.parse(alarm.cause))
-        message = f"{alarm.state}: {what}, {percent(share)}; {message}"
-    elif alarm.state == SUSPECTED:
-        message = f"{alarm.state}: {message}"
-    return Status("arm", LEVELS[alarm.state], message, values)
+        message = f"{what}, {percent(share)}; {message}"
+    if alarm.threshold is not None and not is_sure(diagnosis):
+        message += f"; alarm threshold {percent(alarm.threshold)}, by --false-alarms-per-100h"
+    return Status("arm", STATES[alarm.state], message, values)
 
 
 def _episode(alarm: Alarm) -> dict[str, str]:
@@ -111,10 +144,10 @@ def _motor(diagnosis: Diagnosis, alarm: Alarm, motor: str) -> Status:
     )
     if ranked and f"{motor}:{ranked[0]}" in diagnosis.ranked[0].split("+"):
         values |= _size(diagnosis)
-    level = _level(alarm, motor)
-    if level == LEVEL_OK or not ranked:
-        return Status(motor, level, f"no fault seen ({100 * total:.1f} % faulty)", values)
-    return Status(motor, level, f"{ranked[0]}, {100 * total:.1f} %", values)
+    state = STATES[alarm.state if _concerns(alarm, motor) else CLEAR]
+    if state == OK or not ranked:
+        return Status(motor, state, f"no fault seen ({100 * total:.1f} % faulty)", values)
+    return Status(motor, state, f"{ranked[0]}, {100 * total:.1f} %", values)
 
 
 def _size(diagnosis: Diagnosis) -> dict[str, str]:
@@ -131,6 +164,6 @@ def _number(value: float) -> str:
     return f"{value:.6g}"
 
 
-def _level(alarm: Alarm, name: str) -> int:
-    """Return the level of the arm, or of a motor by its name."""
-    return LEVELS[alarm.state] if name == "arm" or alarm.concerns(name) else LEVEL_OK
+def _concerns(alarm: Alarm, name: str) -> bool:
+    """Return whether an alarm is of a motor; it is always of the arm."""
+    return name == "arm" or alarm.concerns(name)

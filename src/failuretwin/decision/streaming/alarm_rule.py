@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import expit
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, Episode
@@ -114,7 +115,7 @@ class AlarmRule:
             over = Episode(episode.number, episode.cause, episode.raised_s, time)
             self.alarm = Alarm(CLEAR, "", over)
         elif named and cause != episode.cause and above >= 0.0:
-            self.alarm = Alarm(RAISED, cause, Episode(episode.number + 1, cause, time))
+            self._raise(episode.number + 1, cause, time)
 
     def _while_not(
         self, time: float, above: float, cause: str, named: bool, concluded_h: float
@@ -125,14 +126,17 @@ class AlarmRule:
         if above < 0.0:
             self._unnamed = 0
         if above >= 0.0 and (named or self._unnamed >= PATIENCE):
-            number = 1 if last is None else last.number + 1
-            self.alarm = Alarm(RAISED, cause, Episode(number, cause, time))
+            self._raise(1 if last is None else last.number + 1, cause, time)
             self._unnamed = 0
         elif above >= -np.log(SUSPICION):
             self.alarm = Alarm(SUSPECTED, cause, last)
         elif self.alarm.state != CLEAR:
             self.passed += 1
             self.alarm = Alarm(CLEAR, "", last)
+
+    def _raise(self, number: int, cause: str, time: float) -> None:
+        threshold = float(expit(self.log_odds))
+        self.alarm = Alarm(RAISED, cause, Episode(number, cause, time), threshold)
 
 
 def movements_to_tell(

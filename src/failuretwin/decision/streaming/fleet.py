@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray, IntArray, as_floats
+from failuretwin.decision.streaming import STREAMED
 from failuretwin.decision.streaming.tracking import MovementTracker
 from failuretwin.decision.streaming.trouble import (
     DEAD,
@@ -49,8 +50,6 @@ MOVEMENTS = 5
 SILENCE_S = 5.0
 """Without a reading for so long nothing is known of the present [s]; the bus of the ArmPi stalls
 for 4 s."""
-STREAMED = ("tool", "tool+encoders", "tool+goals", "tool+encoders+goals")
-"""What a stream may believe."""
 
 
 @dataclass(frozen=True)
