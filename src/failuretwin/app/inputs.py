@@ -117,7 +117,7 @@ def _with_map(
     if not path.exists():
         raise _guessed(path, logs, robot)
     if path.suffix == ".json":
-        return replace(options, lerobot=LeRobotAngles(calibration=str(path))), None
+        return replace(options, lerobot=stated_angles(path)), None
     table, correction = read_toml(path), None
     if CORRECTION in table:
         where = f"{path}: {CORRECTION}"
@@ -127,11 +127,26 @@ def _with_map(
         topics = from_table(BagTopics, table["topics"], f"{path}: topics")
         options = replace(options, topics=topics)
     elif "lerobot" in table:
-        angles = from_table(LeRobotAngles, table["lerobot"], f"{path}: lerobot")
-        options = replace(options, lerobot=angles)
+        options = replace(options, lerobot=stated_angles(path))
     elif set(table) != {CORRECTION}:
         options = replace(options, columns=read_column_map(path, robot))
     return options, correction
+
+
+def stated_angles(path: Path | None) -> LeRobotAngles | None:
+    """Return what a map, or a calibration file of LeRobot (.json), states of angles; None: nothing.
+
+    Raises:
+        InputError: If the file cannot be read.
+    """
+    if path is not None and path.suffix == ".json":
+        return LeRobotAngles(calibration=str(path))
+    table = {} if path is None else read_toml(path)
+    if path is None or "lerobot" not in table:
+        return None
+    angles = from_table(LeRobotAngles, table["lerobot"], f"{path}: lerobot")
+    beside = path.parent / angles.calibration
+    return replace(angles, calibration=str(beside)) if angles.calibration else angles
 
 
 def _guessed(path: Path, logs: Sequence[Path], robot: Robot) -> InputError:

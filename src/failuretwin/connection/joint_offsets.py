@@ -54,6 +54,8 @@ class JointOffset:
         interval_90: 90 % interval of the same [rad].
         probability: Probability that there is one.
         stops: Number of stops that it was judged by.
+        steady: Whether the first and the last third of the stops agree: their medians differ by
+            less than half of the size.
     """
 
     motor: str
@@ -61,11 +63,12 @@ class JointOffset:
     interval_90: Interval
     probability: float
     stops: int
+    steady: bool
 
     @property
     def found(self) -> bool:
-        """Whether the offset is there by 95 %."""
-        return self.probability >= SURE
+        """Whether the offset is there by 95 %, and all the time."""
+        return self.steady and self.probability >= SURE
 
 
 class _Stops(NamedTuple):
@@ -191,9 +194,10 @@ def _offset(
     grid = size + np.linspace(-1.0, 1.0, 4001) * 8.0 * float(np.max(width))
     below = np.einsum("cs,csg->g", weight, ndtr((grid - centre[..., None]) / width[..., None]))
     low, high = np.interp([0.05, 0.95], below, grid)
-    return JointOffset(
-        motor, size, (float(low), float(high)), float(odds / (1.0 + odds)), len(errors)
-    )
+    third = (len(errors) + 2) // 3
+    change = abs(float(np.median(errors[:third]) - np.median(errors[-third:])))
+    sure, steady = float(odds / (1.0 + odds)), change < 0.5 * abs(size)
+    return JointOffset(motor, size, (float(low), float(high)), sure, len(errors), steady)
 
 
 def _fit(
