@@ -247,8 +247,8 @@ def _calibration_in(path: Path) -> Path | None:
 
 def _is_calibration(file: Path) -> bool:
     try:
-        joints = json.loads(read_text(file, "JSON"))
-    except (InputError, ValueError):
+        joints = _json(file)
+    except InputError:
         return False
     return (
         isinstance(joints, dict)
@@ -257,14 +257,18 @@ def _is_calibration(file: Path) -> bool:
     )
 
 
+def _json(file: Path) -> Any:
+    with reading(file, "JSON"):
+        return json.loads(read_text(file, "JSON"))
+
+
 def _ranges(file: Path, robot: Robot) -> FloatArray:
     """Return ``range_min`` and ``range_max`` of each motor, (2, motor) [counts].
 
     Raises:
         InputError: If the file is no calibration file of LeRobot, or lacks a joint.
     """
-    with reading(file, "JSON"):
-        joints = json.loads(read_text(file, "JSON"))
+    joints = _json(file)
     if not _is_calibration(file):
         raise InputError(
             f"{file}: no calibration of LeRobot. Expected for each joint range_min and range_max, "
@@ -274,11 +278,11 @@ def _ranges(file: Path, robot: Robot) -> FloatArray:
     for joint in wanted:
         check_name("joint", joint, joints, f"{file} lacks a joint of {robot.name!r}: ")
     ends = [[joints[joint].get(end) for joint in wanted] for end in ("range_min", "range_max")]
-    sound = all(isinstance(end, int | float) for row in ends for end in row)
-    ranges = as_floats(ends) if sound else np.zeros((2, 1))
-    if not np.all(np.diff(ranges, axis=0) > 0.0):
-        raise InputError(
-            f"{file}: range_min and range_max are {ends}. Expected numbers [counts], range_min the "
-            "smaller one. Calibrate the arm again, or state low and high in a map."
-        )
+    with reading(file, "a calibration of LeRobot", "Calibrate the arm again."):
+        ranges = as_floats(ends)
+        if not (np.isfinite(ranges).all() and np.all(np.diff(ranges, axis=0) > 0.0)):
+            raise InputError(
+                f"{file}: range_min and range_max are {ends}. Expected counts, range_min the "
+                "smaller one. Calibrate the arm again, or state low and high in a map."
+            )
     return ranges
