@@ -127,6 +127,16 @@ def test_a_wrong_calibration_file_is_explained(failuretwin, tmp_path, healthy, c
     assert message in done.stderr
 
 
+def test_the_calibration_of_another_arm_is_refused(failuretwin, tmp_path, healthy):
+    folder = written(tmp_path / "pick", healthy, "normalised")
+    write_calibration(folder / "leader.json", [(low - 50, high + 50) for low, high in RANGES])
+
+    done = failuretwin("diagnose", folder, "--robot", "so101")
+
+    assert done.returncode == 2
+    assert "Expected the calibration of the follower" in done.stderr
+
+
 def test_two_calibration_files_are_ambiguous(failuretwin, tmp_path, healthy):
     folder = written(tmp_path / "pick", healthy)
     for name in ("leader.json", "follower.json"):
@@ -150,6 +160,7 @@ def test_a_guess_is_said_and_one_option_settles_it(failuretwin, tmp_path, health
     assert guess.returncode == told.returncode == 0, guess.stderr + told.stderr
     assert re.search(r"note: LeRobot v3.0, angles in deg \(guessed: .*--columns", guess.stderr)
     assert "note" not in told.stderr
+    assert "joint offsets: none found; 5 of 5 joints follow their commands" in told.stdout
 
 
 @pytest.mark.parametrize("version", [V2, V3])

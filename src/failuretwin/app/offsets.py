@@ -52,12 +52,14 @@ def offset_lines(
     reading: LogOptions,
     out: Path | None,
 ) -> list[str]:
-    """Return a line for each offset that is found, and write a corrected copy to `out`, if any.
+    """Return lines on the offsets in LeRobot data, and write a corrected copy to `out`, if any.
 
     Raises:
         InputError: If there is nothing to correct.
         OutputError: If the copy cannot be written.
     """
+    if not str(runs.attrs.get("source", "")).startswith("LeRobot"):
+        return []
     offsets = _offsets(runs, known, diagnoses)
     lines = [
         f"joint offset: {_in_words(offset, known.robot)}, in every episode; {_sure(offset)}"
@@ -67,15 +69,16 @@ def offset_lines(
     if out is not None:
         angles = stated_angles(reading.columns)
         return [*lines, _corrected(reading.logs[0], out, known.robot, angles, offsets)]
-    return [*lines, "--correct OUT writes a copy of the data set without it"] if lines else []
+    if lines:
+        return [*lines, "--correct OUT writes a copy of the data set without it"]
+    judged = f"{len(offsets)} of {len(known.robot.motors)} joints"
+    return [f"joint offsets: none found; {judged} follow their commands and stop often enough"]
 
 
 def _offsets(
     runs: xr.Dataset, known: CalibratedRobot, diagnoses: Sequence[Diagnosis]
 ) -> list[JointOffset]:
-    """Return the offsets of LeRobot data; of other logs, and of stuck motors, none."""
-    if not str(runs.attrs.get("source", "")).startswith("LeRobot"):
-        return []
+    """Return the offsets of joints; of stuck motors, none."""
     stuck = {
         fault.motor
         for one in diagnoses

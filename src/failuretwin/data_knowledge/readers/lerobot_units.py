@@ -41,6 +41,8 @@ ON_GRID = 0.02
 """Largest distance of a reading from the grid of encoder counts [steps]."""
 SAME_SCALE = 1e-3
 """Largest relative difference of two equal scales; 360/4095 and 360/4096 deg differ by 2.4e-4."""
+OTHER_RANGE = 0.01
+"""Relative difference of two ranges that are not of one calibration."""
 SMALLEST_RANGE = 0.125
 """Smallest range that a joint is calibrated with [turns]; the largest is one turn."""
 
@@ -146,11 +148,23 @@ def found_angles(
         return found, scale.reason
     if ranges is not None:
         half = np.diff(ranges, axis=0)[0] / 2.0 * np.rad2deg(robot.servo_units.rad_per_count)
+        _check_ranges(half, steps, f"{file}")
         low, high, where = -half, half, f"range of {file.name}" if file else ""
     else:
         low, high, where = _fallback_range(steps, robot)
     ends = [tuple(np.round(end, 4).tolist()) for end in (low, high)]
     return replace(found, low=ends[0], high=ends[1]), f"{scale.reason}; {where}"
+
+
+def _check_ranges(half: FloatArray, steps: _Scale, file: str) -> None:
+    """Raise InputError if a calibration file is not of the arm whose encoder steps are seen."""
+    seen = half if steps.half_range is None else steps.half_range
+    if np.any(np.abs(seen / half - 1.0) > OTHER_RANGE):
+        raise InputError(
+            f"{file}: its joints turn {np.round(half, 1).tolist()} deg to either side, but the "
+            f"encoder steps of the readings say {np.round(seen, 1).tolist()}. Expected the "
+            "calibration of the follower at the time of recording: name another, or none."
+        )
 
 
 def _fallback_range(steps: _Scale, robot: Robot) -> tuple[FloatArray, FloatArray, str]:
