@@ -21,7 +21,7 @@ from failuretwin.core.hypothesis import parse_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.readers.bag_messages import BagTopics
 from failuretwin.data_knowledge.readers.column_map import read_column_map
-from failuretwin.data_knowledge.readers.lerobot import LeRobotAngles
+from failuretwin.data_knowledge.readers.lerobot_units import LeRobotAngles
 from failuretwin.data_knowledge.readers.matlab import export_runs
 from failuretwin.data_knowledge.readers.read import ReadOptions
 from failuretwin.data_knowledge.step_tests import read_step_test

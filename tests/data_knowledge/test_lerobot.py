@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 
@@ -9,9 +8,10 @@ import pytest
 
 from failuretwin import DigitalTwin, ReadOptions, diagnose, load_robot, read_runs
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.readers.lerobot import LeRobotAngles
+from failuretwin.data_knowledge.readers.lerobot import read_lerobot
+from failuretwin.data_knowledge.readers.lerobot_units import LeRobotAngles
+from lerobot_writers import NAMES, write_info, write_table
 
-NAMES = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
 WIDE = {"low": (-110.0, -100.0, -97.0, -95.0, -180.0), "high": (110.0, 100.0, 97.0, 95.0, 180.0)}
 
 
@@ -20,38 +20,6 @@ def frames(count, scale=1.0):
     ramp = np.clip(np.arange(count) / 30.0 - 0.5, 0.0, 1.0)
     action = np.outer(ramp, [20.0, -30.0, 25.0, 10.0, 5.0, 50.0]) * scale
     return action, np.concatenate([action[:1], action[:-1]])
-
-
-def write_info(folder, version, names, fps=30):
-    feature = {"dtype": "float32", "shape": [6], "names": names}
-    info = {
-        "codebase_version": version,
-        "robot_type": "so101_follower",
-        "fps": fps,
-        "features": {"action": feature, "observation.state": feature},
-    }
-    (folder / "meta").mkdir(parents=True)
-    (folder / "meta" / "info.json").write_text(json.dumps(info))
-
-
-def write_table(path, episodes):
-    """Write a parquet file as the recorder does: a row a frame, vectors of 32-bit numbers."""
-    pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed: extra lerobot")
-    import pyarrow.parquet as pq
-
-    columns = {"action": [], "observation.state": [], "timestamp": []}
-    columns |= {"frame_index": [], "episode_index": []}
-    for number, (action, state) in episodes.items():
-        columns["action"] += action.tolist()
-        columns["observation.state"] += state.tolist()
-        columns["timestamp"] += (np.arange(len(action)) / 30.0).tolist()
-        columns["frame_index"] += range(len(action))
-        columns["episode_index"] += [number] * len(action)
-    vector, whole = pa.list_(pa.float32(), 6), pa.int64()
-    kinds = [vector, vector, pa.float32(), whole, whole]
-    arrays = [pa.array(v, k) for v, k in zip(columns.values(), kinds, strict=True)]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(pa.table(arrays, names=list(columns)), path)
 
 
 def write_v2(folder, scale=1.0):
@@ -98,7 +66,8 @@ def test_the_tool_path_is_the_forward_kinematics_of_the_readings(tmp_path):
     np.testing.assert_allclose(measured[seen], DigitalTwin(robot).path(position[seen]), atol=1e-12)
     assert np.isnan(measured[~seen]).all()
     assert runs.attrs["source"] == (
-        "LeRobot v3.0, angles in degrees (assumed); tool path = forward kinematics of the readings"
+        "LeRobot v3.0, angles in deg (guessed: -100 to 100 is possible too); "
+        "tool path = forward kinematics of the readings"
     )
 
 
@@ -111,7 +80,7 @@ def test_normalised_angles_span_the_range_that_the_map_gives(tmp_path):
     np.testing.assert_allclose(
         np.rad2deg(runs["command"][0, -1]), [88.0, -100.0, 97.0, 38.0, 36.0], atol=1e-4
     )
-    assert runs.attrs["source"].startswith("LeRobot v3.0, angles in normalised;")
+    assert runs.attrs["source"].startswith("LeRobot v3.0, angles in normalised (stated);")
 
 
 def test_where_a_command_is_clipped_nothing_is_read(tmp_path):
@@ -136,14 +105,17 @@ def test_sign_and_zero_turn_and_shift_joints(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("scale", "clip", "why"),
-    [(4.0, 100.0, "the largest is exactly 100"), (0.1, np.inf, r"none is larger than 3\.00")],
+    ("scale", "clip", "unit", "why"),
+    [
+        (4.0, 100.0, "normalised", "the largest is exactly 100; range guessed from the limits"),
+        (0.1, np.inf, "rad", "none is larger than 3.00"),
+        (5.0, np.inf, "deg", "the largest is 150"),
+    ],
 )
-def test_angles_that_are_no_degrees_ask_for_a_map(tmp_path, scale, clip, why):
-    folder = write_v3(tmp_path / "pick", scale, clip)
+def test_a_unit_that_nothing_states_is_guessed_by_size_and_said(tmp_path, scale, clip, unit, why):
+    runs = read_runs(write_v3(tmp_path / "pick", scale, clip), "so101")
 
-    with pytest.raises(InputError, match=rf"not degrees.*{why}.*--columns"):
-        read_runs(folder, "so101")
+    assert runs.attrs["source"].startswith(f"LeRobot v3.0, angles in {unit} (guessed: {why}")
 
 
 def test_the_guessed_map_leads_to_a_verdict(tmp_path):
@@ -179,7 +151,7 @@ def test_joints_of_the_map_name_channels_of_other_names(tmp_path):
     ("told", "message"),
     [
         ({"unit": "degrees"}, "unknown unit 'degrees'"),
-        ({"unit": "normalised"}, "need low and high"),
+        ({"unit": "normalised", "low": (1.0,)}, "low has 1 entries and high 0"),
     ],
 )
 def test_a_wrong_map_is_explained(told, message):
@@ -214,9 +186,13 @@ def teleoperated(data):
     return folder
 
 
-def test_a_real_data_set_is_seen_to_be_normalised(teleoperated):
-    with pytest.raises(InputError, match="the largest is exactly 100"):
-        read_runs(teleoperated, "so101")
+def test_a_real_data_set_shows_unit_and_ranges_by_its_encoder_steps(teleoperated):
+    """Ranges of 2549, 2303, 2205, 2287 and 3835 counts: whole numbers, as they were calibrated."""
+    found = read_lerobot(teleoperated, load_robot("so101"))
+
+    assert "normalised (by the encoder steps" in found.source
+    counts = np.array([2549, 2303, 2205, 2287, 3835])
+    np.testing.assert_allclose(found.angles.high, counts / 2 * 360 / 4096, rtol=1e-6)
 
 
 def test_a_real_data_set_is_read_whole(teleoperated):
@@ -230,9 +206,7 @@ def test_a_real_data_set_is_read_whole(teleoperated):
 
 def test_a_real_teleoperated_arm_gets_no_verdict_where_it_never_rests_freely(teleoperated):
     """The healthy arm rests folded alone, its elbow told to go to the very end of its range."""
-    told = ReadOptions(lerobot=LeRobotAngles("normalised", **WIDE))
-
-    found = diagnose(read_runs(teleoperated, "so101", told), robot="so101")
+    found = diagnose(read_runs(teleoperated, "so101"), robot="so101")
 
     assert [d.verdict for d in found] == 4 * [
         "cannot tell, because the tool is not seen at rest after any movement"

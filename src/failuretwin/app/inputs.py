@@ -18,7 +18,8 @@ from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.readers.bag_messages import BagTopics
 from failuretwin.data_knowledge.readers.column_guess import column_map_text
 from failuretwin.data_knowledge.readers.column_map import CORRECTION, read_column_map
-from failuretwin.data_knowledge.readers.lerobot import LeRobotAngles, is_lerobot, lerobot_map_text
+from failuretwin.data_knowledge.readers.lerobot import is_lerobot, lerobot_map_text
+from failuretwin.data_knowledge.readers.lerobot_units import GUESSED, LeRobotAngles
 from failuretwin.data_knowledge.readers.matlab import RECOVERY_ERROR, RECOVERY_WORST
 from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import write_text
@@ -55,6 +56,9 @@ def read_inputs(
     runs = read_runs(list(logs), robot, options)
     if correction is not None:
         runs = correction.runs(runs)
+    source = str(runs.attrs.get("source", ""))
+    if source.startswith("LeRobot") and GUESSED in source:
+        tell(f"note: {source.rpartition('; ')[0]}. State it with --columns MAP.toml", err=True)
     error = float(runs.attrs.get(RECOVERY_ERROR, 0.0))
     if error > REPORTED_ERROR_M:
         tell(
@@ -112,6 +116,8 @@ def _with_map(
     """
     if not path.exists():
         raise _guessed(path, logs, robot)
+    if path.suffix == ".json":
+        return replace(options, lerobot=stated_angles(path)), None
     table, correction = read_toml(path), None
     if CORRECTION in table:
         where = f"{path}: {CORRECTION}"
@@ -121,11 +127,26 @@ def _with_map(
         topics = from_table(BagTopics, table["topics"], f"{path}: topics")
         options = replace(options, topics=topics)
     elif "lerobot" in table:
-        angles = from_table(LeRobotAngles, table["lerobot"], f"{path}: lerobot")
-        options = replace(options, lerobot=angles)
+        options = replace(options, lerobot=stated_angles(path))
     elif set(table) != {CORRECTION}:
         options = replace(options, columns=read_column_map(path, robot))
     return options, correction
+
+
+def stated_angles(path: Path | None) -> LeRobotAngles | None:
+    """Return what a map, or a calibration file of LeRobot (.json), states of angles; None: nothing.
+
+    Raises:
+        InputError: If the file cannot be read.
+    """
+    if path is not None and path.suffix == ".json":
+        return LeRobotAngles(calibration=str(path))
+    table = {} if path is None else read_toml(path)
+    if path is None or "lerobot" not in table:
+        return None
+    angles = from_table(LeRobotAngles, table["lerobot"], f"{path}: lerobot")
+    beside = path.parent / angles.calibration
+    return replace(angles, calibration=str(beside)) if angles.calibration else angles
 
 
 def _guessed(path: Path, logs: Sequence[Path], robot: Robot) -> InputError:

@@ -79,6 +79,14 @@ LEARNING = ("out", "independent")
 @opt.report_option(
     "Write index.html: the state of the robot, what to do, and pictures of some runs."
 )
+@opt.file_option(
+    "--correct",
+    "OUT",
+    "Write a copy of one LeRobot data set in which the joint offsets that are found are taken out. "
+    "An offset is a constant difference of readings from commands where a joint stands still, as "
+    "by a zero that has moved. Only those joints of `observation.state` and its statistics "
+    "change; `action` never does, nor does a stuck motor.",
+)
 @opt.reading_options
 @opt.plugin_option
 @opt.calibrated_robot_options()
@@ -96,6 +104,7 @@ def diagnose(
     json_file: Path | None,
     csv_file: Path | None,
     report: Path | None,
+    correct: Path | None,
     reading: opt.LogOptions,
     robot: opt.RobotOptions,
 ) -> None:
@@ -106,7 +115,7 @@ def diagnose(
     recording, or a CSV file, with --columns where its column names do not tell enough.
     """
     from failuretwin.app import inputs as given
-    from failuretwin.app import learning
+    from failuretwin.app import learning, offsets
     from failuretwin.app.reports import reports
     from failuretwin.app.reports.isolability_report import isolability_summary
     from failuretwin.app.reports.technician_page import write_report
@@ -115,6 +124,7 @@ def diagnose(
     from failuretwin.inference.faults.priors import priors_of
     from failuretwin.inference.observation.sensors import TOOL_ALONE, sensing_of
 
+    offsets.check_correctable(reading.logs, correct)
     known, calibration = robot.known, robot.calibration
     bayes = ft.BayesDiagnoser(
         known.twin,
@@ -159,6 +169,7 @@ def diagnose(
     show(*reports.score_parts(diagnoses))
     last = [*reports.course_lines(course, state, known.robot), *found.lines]
     show(*([""] if last else []), *last)
+    show(*offsets.offset_lines(runs, known, diagnoses, reading, correct))
 
 
 def _refuse_unused(bayes: bool, track: bool, self_calibrate: bool) -> None:

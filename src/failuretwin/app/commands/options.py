@@ -260,7 +260,8 @@ reading_options = gathered(
         "--columns",
         "MAP.toml",
         "Meaning of the columns of a CSV file (or the topics of a bag, or the angles of a LeRobot "
-        "data set). If MAP.toml does not exist, a guess is written there for you to check.",
+        "data set). If MAP.toml does not exist, a guess is written there for you to check. For a "
+        "LeRobot data set it may be the calibration file of the arm (.json).",
     ),
     flag_option(
         "--approximate",

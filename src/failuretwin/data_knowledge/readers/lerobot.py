@@ -19,7 +19,15 @@ import numpy as np
 from failuretwin.core.errors import InputError, check_name, needs_extra
 from failuretwin.core.foreign import check_size, read_text, reading
 from failuretwin.core.types import FloatArray, IntArray, as_floats
-from failuretwin.data_knowledge.readers.column_map import check_entries, map_text
+from failuretwin.data_knowledge.readers.column_map import map_text
+from failuretwin.data_knowledge.readers.lerobot_units import (
+    FULL_SCALE,
+    NAME_PREFIX,
+    NAME_SUFFIX,
+    NORMALISED,
+    LeRobotAngles,
+    found_angles,
+)
 from failuretwin.data_knowledge.readers.timed_log import Samples, TimedLog
 from failuretwin.digital_model.robot import Robot
 
@@ -29,54 +37,8 @@ if TYPE_CHECKING:
 INFO_FILE = Path("meta") / "info.json"
 ACTION, STATE, EPISODE, FRAME = "action", "observation.state", "episode_index", "frame_index"
 COLUMNS = [ACTION, STATE, EPISODE, FRAME]
-DEG, RAD, NORMALISED = "deg", "rad", "normalised"
 NUMBER_BYTES = 40
 """Memory of a number of a list while it is read [bytes]."""
-FULL_SCALE = 100.0
-"""Ends of a normalised joint's range: -100 and 100."""
-NAME_PREFIX, NAME_SUFFIX = "main_", ".pos"
-"""Text that recorders put around the name of a joint: ``main_elbow_flex``, ``elbow_flex.pos``."""
-
-
-@dataclass(frozen=True)
-class LeRobotAngles:
-    """Numbers of a LeRobot data set, commands and readings alike.
-
-    Attributes:
-        unit: deg, rad or normalised: -100 to 100 over the range that the arm was calibrated with.
-        joints: Names of the channels in chain order; empty: those called like the robot's joints.
-        low: For normalised numbers: angle of each motor at -100 [deg].
-        high: Angle of each motor at 100 [deg].
-        sign: 1 or -1 for each motor, where the data set turns the other way; empty: all 1.
-        zero: Angle of each motor in the data set that the robot calls 0 [deg]; empty: all 0.
-    """
-
-    unit: str = DEG
-    joints: tuple[str, ...] = ()
-    low: tuple[float, ...] = ()
-    high: tuple[float, ...] = ()
-    sign: tuple[float, ...] = ()
-    zero: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        check_name("unit", self.unit, (DEG, RAD, NORMALISED))
-        if self.unit == NORMALISED and not (self.low and self.high):
-            raise InputError(
-                "normalised angles need low and high: the angles [deg] that -100 and 100 stand for."
-            )
-
-    def check_motors(self, robot: Robot, where: str) -> None:
-        """Raise InputError unless every list has one entry for each motor."""
-        for name in ("joints", "low", "high", "sign", "zero"):
-            check_entries(name, len(getattr(self, name)) or len(robot.motors), robot, where)
-
-    def to_rad(self, values: FloatArray) -> FloatArray:
-        """Return angles in the robot's sense [rad] of `values` (frame, motor)."""
-        angle = values if self.unit == RAD else np.deg2rad(values)
-        if self.unit == NORMALISED:
-            low, high = np.deg2rad(self.low), np.deg2rad(self.high)
-            angle = low + (values + FULL_SCALE) / (2.0 * FULL_SCALE) * (high - low)
-        return as_floats((angle - np.deg2rad(self.zero or 0.0)) * np.asarray(self.sign or 1.0))
 
 
 def is_lerobot(path: Path) -> bool:
@@ -84,38 +46,45 @@ def is_lerobot(path: Path) -> bool:
     return (path / INFO_FILE).is_file()
 
 
-def read_lerobot(path: Path, robot: Robot, angles: LeRobotAngles | None = None) -> list[TimedLog]:
+@dataclass(frozen=True)
+class LeRobotEpisodes:
+    """Episodes of a LeRobot data set.
+
+    Attributes:
+        logs: One log for each episode.
+        angles: Meaning of its numbers, complete.
+        source: Version, unit and how the unit is known, in words.
+    """
+
+    logs: list[TimedLog]
+    angles: LeRobotAngles
+    source: str
+
+
+def read_lerobot(path: Path, robot: Robot, angles: LeRobotAngles | None = None) -> LeRobotEpisodes:
     """Read the episodes of a LeRobot data set, one log each.
 
     Args:
         path: Its folder.
         robot: The robot it is of; channels of joints that it does not have are left out.
-        angles: Unit and sense of the numbers; None: degrees, unless they cannot be.
+        angles: What is known of the unit and sense of the numbers; None: nothing.
 
     Raises:
-        InputError: If pyarrow is missing, the data set cannot be read, lacks a joint, or holds
-            angles that cannot be degrees and no unit is given.
+        InputError: If pyarrow is missing, or the data set cannot be read or lacks a joint.
     """
-    known, info = angles or LeRobotAngles(), _info(path)
+    known, info = angles or LeRobotAngles(), lerobot_info(path)
     known.check_motors(robot, f"{path}: the map")
-    frames = _all_frames(path, info, known, robot)
-    unit, reason = _likely_unit(frames)
-    if angles is None and unit != DEG:
-        raise InputError(
-            f"{path}: its angles are not degrees, it seems: {reason}. Say what they are: add "
-            "--columns MAP.toml; if that file does not exist, a guess is written there for you to "
-            "check."
-        )
     rate = info.get("fps")
     if not (isinstance(rate, int | float) and rate > 0):
         raise InputError(f"{path / INFO_FILE}: fps is {rate!r}, expected frames a second.")
+    frames = _all_frames(path, info, known, robot)
+    named = channel_names(info, STATE)
+    names = [named[i] for i in state_channels(path, info, known, robot)]
+    found, how = found_angles(info, names, frames.state, path, robot, known)
+    version = info.get("codebase_version", "of unknown version")
     numbers = np.unique(frames.episode)
-    return [_episode(frames, int(number), float(rate), known, path) for number in numbers]
-
-
-def lerobot_version(path: Path) -> str:
-    """Return the version of the format that a data set says it has, such as ``v3.0``."""
-    return str(_info(path).get("codebase_version", "of unknown version"))
+    logs = [_episode(frames, int(n), float(rate), found, path, robot) for n in numbers]
+    return LeRobotEpisodes(logs, found, f"LeRobot {version}, angles in {found.unit} ({how})")
 
 
 @dataclass(frozen=True)
@@ -128,12 +97,24 @@ class _Frames:
     state: FloatArray
 
 
-def _info(path: Path) -> dict[str, Any]:
+def lerobot_info(path: Path) -> dict[str, Any]:
+    """Return ``meta/info.json`` of a data set.
+
+    Raises:
+        InputError: If it cannot be read or describes no features.
+    """
     with reading(path / INFO_FILE, "JSON"):
         info = json.loads(read_text(path / INFO_FILE, "JSON"))
     if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
         raise InputError(f"{path / INFO_FILE}: has no features. Expected a LeRobot data set.")
     return info
+
+
+def state_channels(
+    path: Path, info: Mapping[str, Any], known: LeRobotAngles, robot: Robot
+) -> list[int]:
+    """Return which channel of ``observation.state`` belongs to each motor."""
+    return _channels(info, STATE, known, robot, path)
 
 
 def _channels(
@@ -208,19 +189,8 @@ def _claimed_bytes(said: pq.FileMetaData, motors: int) -> int:
     return NUMBER_BYTES * max(values, said.num_rows * motors)
 
 
-def _likely_unit(frames: _Frames) -> tuple[str, str]:
-    """Return the unit of the values, which the data set itself never says, and why."""
-    values = np.concatenate([frames.action, frames.state])
-    size = float(np.nanmax(np.abs(values)))
-    if size == FULL_SCALE:
-        return NORMALISED, "the largest is exactly 100, as where they are clipped to -100..100"
-    if size <= 2.0 * np.pi:
-        return RAD, f"none is larger than {size:.2f}"
-    return DEG, ""
-
-
 def _episode(
-    frames: _Frames, number: int, rate_hz: float, known: LeRobotAngles, path: Path
+    frames: _Frames, number: int, rate_hz: float, known: LeRobotAngles, path: Path, robot: Robot
 ) -> TimedLog:
     """Return one episode, without the readings of frames whose command is at the end of its range.
 
@@ -235,39 +205,31 @@ def _episode(
         state = np.where(free, state, np.nan)
     return TimedLog(
         name=f"{path.resolve().name}/episode_{number:06d}",
-        command=Samples(time, known.to_rad(action)),
-        position=Samples(time, known.to_rad(state)),
+        command=Samples(time, known.to_rad(action, robot)),
+        position=Samples(time, known.to_rad(state, robot)),
     )
 
 
 HINTS = """\
 Channels of the data set: {channels}
 Motors of {robot}, in this order: {motors}
-unit is deg, rad, or normalised (-100 to 100, the older default).
+unit is deg, rad, servo (encoder counts), or normalised (-100 to 100). Here: {source}
 joints = []   channels in the order of the motors, where names do not tell
 For normalised numbers, low and high are what -100 and 100 stand for [deg], from the middle of each
-joint's range. Here: the limits of the URDF. Better: range_min and range_max of the arm's own
-calibration file; half their difference times 360/4096, below and above zero.
+joint's range; calibration = "FILE.json" takes them from the arm's own calibration file instead.
 sign = []     1 or -1 for each motor, where the data set turns the other way
 zero = []     angle of the data set that the robot calls 0 [deg]"""
 
 
 def lerobot_map_text(path: Path, robot: Robot) -> str:
-    """Return a commented map for a data set, ready to be corrected.
-
-    The range of a normalised joint is that of the robot's URDF: recorders take that range by
-    moving each joint from end to end by hand.
-    """
-    info = _info(path)
-    unit, _ = _likely_unit(_all_frames(path, info, LeRobotAngles(), robot))
+    """Return a commented map for a data set, ready to be corrected."""
+    found = read_lerobot(path, robot)
     hints = HINTS.format(
-        channels=", ".join(channel_names(info, STATE)),
+        channels=", ".join(channel_names(lerobot_info(path), STATE)),
         robot=robot.name,
         motors=", ".join(f"{motor.name} ({motor.joint})" for motor in robot.motors),
+        source=found.source,
     )
-    content: dict[str, Any] = {"unit": unit}
-    if unit == NORMALISED:
-        limits = np.rad2deg([(joint.low, joint.high) for joint in robot.chain.joints])
-        ends = np.clip(limits, -180.0, 180.0).round(1).T.tolist()
-        content |= {"low": ends[0], "high": ends[1]}
+    angles = found.angles
+    content: dict[str, Any] = {"unit": angles.unit, "low": angles.low, "high": angles.high}
     return map_text(f"Map for the LeRobot data set {path.name}", hints, {"lerobot": content})

@@ -20,11 +20,10 @@ from failuretwin.data_knowledge.readers.column_guess import unambiguous_columns
 from failuretwin.data_knowledge.readers.column_map import ColumnMap
 from failuretwin.data_knowledge.readers.lerobot import (
     INFO_FILE,
-    LeRobotAngles,
     is_lerobot,
-    lerobot_version,
     read_lerobot,
 )
+from failuretwin.data_knowledge.readers.lerobot_units import LeRobotAngles
 from failuretwin.data_knowledge.readers.matlab import (
     RECOVERY_ERROR,
     RECOVERY_WORST,
@@ -160,9 +159,8 @@ def _read_bag(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset
 
 
 def _read_lerobot(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
-    unit = "degrees (assumed)" if options.lerobot is None else options.lerobot.unit
-    source = f"LeRobot {lerobot_version(path)}, angles in {unit}"
-    return _log_datasets(read_lerobot(path, robot, options.lerobot), robot, source)
+    found = read_lerobot(path, robot, options.lerobot)
+    return _log_datasets(found.logs, robot, found.source)
 
 
 def _read_folder(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
