@@ -411,7 +411,7 @@ def test_the_source_of_the_tutorial_watches_a_real_log(failuretwin, source_file,
     )
 
     assert done.returncode == 0, done.stderr
-    assert "last answer: healthy" in done.stdout
+    assert "last answer: OK: healthy" in done.stdout
 
 
 def test_the_source_of_the_tutorial_teleoperates(source_file, healthy, so101, monkeypatch):

@@ -136,6 +136,16 @@ class Stretches(Movements):
         """Return the reference at the start of each stretch, (run, movement, motor) [rad]."""
         return self.beginning
 
+    @property
+    def on_the_way(self) -> BoolArray:
+        """Which runs have readings on the way, (run,)."""
+        return np.asarray((self.exists & ~self.at_rest).any(axis=1))
+
+    @property
+    def as_movements(self) -> Movements:
+        """The stretches as movements, of runs that are seen at rest."""
+        return Movements(self.initial, self.target, self.ramp_duration, self.start)
+
 
 def stack_movements(parts: Sequence[Movements]) -> Movements:
     """Return the movements of all `parts` along the run axis, padded to the largest count."""

@@ -182,7 +182,7 @@ class BayesDiagnoser:
         self._check(runs)
         model = self.healthy_model.seen_by(sensing_of(runs, self.sensing))
         self._check_shown(model)
-        found = SeenRuns(runs, model, self.hypothesis_set, self.priors)
+        found = SeenRuns(runs, model, self.hypothesis_set, self.priors, self.whole_run)
         if found.evidence.sound.settled.movements.start.shape[1] == 0:
             raise InputError(
                 "no run holds a movement: `command` never leaves its first value. Expected runs "

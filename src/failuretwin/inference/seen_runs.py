@@ -72,12 +72,14 @@ class SeenRuns:
         model: The healthy robot.
         hypotheses: What may be the case.
         priors: Beliefs about faults and set-ups.
+        whole_run: Whether readings on the way count.
     """
 
     runs: xr.Dataset
     model: HealthyModel
     hypotheses: Sequence[Hypothesis]
     priors: Priors
+    whole_run: bool = True
 
     @cached_property
     def evidence(self) -> Evidence:
@@ -87,7 +89,8 @@ class SeenRuns:
     @cached_property
     def settled(self) -> SettledEvidence:
         """Where the tool settled after each movement, or was on its way."""
-        return on_the_way(self.evidence.sound, self.model)
+        sound = self.evidence.sound
+        return on_the_way(sound, self.model) if self.whole_run else sound.settled
 
     @cached_property
     def healthy(self) -> HealthyModel:
@@ -124,10 +127,11 @@ class SeenRuns:
 
     @cached_property
     def sample(self) -> RunLikelihood:
-        """Some of the runs by their settled positions."""
-        count = len(self.settled.usable)
-        some = np.unique(np.linspace(0, count - 1, JUDGED_RUNS).astype(np.int64))
-        return RunLikelihood(self.settled[some], self.healthy)
+        """Some of the runs by their settled positions; on the way where none rests."""
+        moving = self.settled.on_the_way
+        rows = np.flatnonzero(~moving) if not moving.all() else np.arange(len(moving))
+        some = np.unique(np.linspace(0, len(rows) - 1, JUDGED_RUNS).astype(np.int64))
+        return RunLikelihood(self.settled.alike(rows[some]), self.healthy)
 
     @cached_property
     def in_doubt(self) -> bool:
@@ -190,7 +194,8 @@ class SeenRuns:
             moving: Readings on the way of all runs; None: they are left aside.
         """
         way = None if moving is None else moving[rows]
-        likelihood = RunLikelihood(self.settled[rows], self.healthy, way)
+        all_runs = np.arange(len(self.settled.usable))
+        likelihood = RunLikelihood(self.settled.alike(all_runs[rows]), self.healthy, way)
         return shared_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt)
 
     def robots(self, named: Posterior, common: Sequence[str], others: bool) -> RobotMixture:

@@ -17,7 +17,6 @@ from dataclasses import replace
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.core.movements import Stretches
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import GENERIC_NAME
 from failuretwin.inference.engine.posterior import misfit_of, theta_factors
@@ -74,7 +73,7 @@ def displaced_weighing(
 
 def _usual(likelihood: RunLikelihood) -> tuple[Layout, Components]:
     model = likelihood.model
-    layout = layout_of(model.without_doubt, isinstance(likelihood.evidence.movements, Stretches))
+    layout = layout_of(model.without_doubt, bool(likelihood.evidence.on_the_way.any()))
     factors = model.imperfections.name == GENERIC_NAME and model.scatter_factor == 1.0
     return layout, robot_components(model, layout, factors)
 
@@ -180,7 +179,7 @@ def sensor_in_doubt(
         return False
     settled = replace(likelihood, moving=None)
     told = [*ranked, *(h for h in hypotheses if len(h.faults) > 1)]
-    if offsets_in_doubt(settled.model).offsets:
+    if offsets_in_doubt(settled.model).offsets or settled.evidence.on_the_way.any():
         found = robot_posterior(settled, told, priors).log_posterior
     else:
         found = compute_posterior(settled, told, priors).log_posterior
@@ -245,7 +244,7 @@ def evidence_at_once(
 ) -> FloatArray:
     """Return log p(run | h), theta as told where every reading is at rest, (run, hypothesis)."""
     ranked = any(has_rows(h) for h in hypotheses)
-    if ranked and isinstance(likelihood.evidence.movements, Stretches):
+    if ranked and likelihood.evidence.on_the_way.any():
         return robot_evidence(likelihood, hypotheses, priors)
     says = marginal_likelihoods(likelihood, hypotheses, priors)
     return np.stack([one.log_evidence for one in says], axis=1)

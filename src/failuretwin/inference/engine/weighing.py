@@ -282,6 +282,6 @@ def assembled(
         first.log_prior,
         np.stack([parts[p].log_posterior[r] for p, r in places]),
         [weight(h) for h in range(len(first.hypotheses))],
-        [parts[p].set_up[r] for p, r in places],
-        [parts[p].offsets[r] for p, r in places],
+        [parts[p].set_up[r] if parts[p].set_up else "" for p, r in places],
+        [parts[p].offsets[r] if parts[p].offsets else "" for p, r in places],
     )

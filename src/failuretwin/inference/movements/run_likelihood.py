@@ -69,6 +69,10 @@ class RunLikelihood:
             self, evidence=self.evidence[rows], moving=moving, remembered=self.findings[rows]
         )
 
+    def alike(self, runs: IntArray) -> RunLikelihood:
+        """Return some of the runs alone, all seen at rest or all on the way."""
+        return replace(self[runs], evidence=self.evidence.alike(runs))
+
     @cached_property
     def findings(self) -> MovementLikelihoods:
         """What every movement says by itself."""

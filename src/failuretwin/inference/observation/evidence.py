@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from failuretwin.core.movements import Movements, find_movements
+from failuretwin.core.movements import Movements, Stretches, find_movements
 from failuretwin.core.numerics import masked_median
 from failuretwin.core.runs import GOAL_VARIABLE, measured_rate
 from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray, IntArray, as_floats
@@ -191,6 +191,20 @@ class SettledEvidence(ArrayStruct):
     def transient_until(self) -> FloatArray:
         """Until when readings are on the way, (run, movement) [s]."""
         return np.where(self.usable, self.begin, self.end)
+
+    @property
+    def on_the_way(self) -> BoolArray:
+        """Which runs have readings on the way in place of rests, (run,)."""
+        if isinstance(self.movements, Stretches):
+            return self.movements.on_the_way
+        return np.zeros(len(self.usable), dtype=bool)
+
+    def alike(self, runs: IntArray) -> SettledEvidence:
+        """Return some runs that are all seen at rest, or all on the way."""
+        some = self[runs]
+        if isinstance(some.movements, Stretches) and not some.on_the_way.any():
+            return replace(some, movements=some.movements.as_movements)
+        return some
 
     def followed_by(self, evidence: SettledEvidence) -> SettledEvidence:
         """Return these runs with others behind them; shorter ones are padded."""

@@ -59,16 +59,19 @@ class _Moment:
 
 
 def on_the_way(evidence: Evidence, model: HealthyModel) -> SettledEvidence:
-    """Return settled positions, and moments on the way of movements without.
+    """Return settled positions, and moments on the way of runs that hardly rest.
 
-    Where every movement was seen at rest, that is what `Evidence.settled` says.
+    Of a run in which half of the movements or more were seen at rest, that is what
+    `Evidence.settled` says: where motors settle is known better than how they get there.
 
     Args:
         evidence: What the runs say.
         model: The healthy robot: its mean lag, and how early its ramps end.
     """
     settled = evidence.settled
-    unseen = settled.movements.exists & ~settled.usable
+    exists, usable = settled.movements.exists, settled.usable
+    hardly = 2 * usable.sum(axis=1) < exists.sum(axis=1)
+    unseen = exists & ~usable & hardly[:, None]
     if not model.sensors.tool_alone or not unseen.any():
         return settled
     looks = _Looks(evidence, model)

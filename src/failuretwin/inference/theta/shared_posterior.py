@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.core.movements import Stretches
 from failuretwin.inference.engine.registration import displaced_posterior, robot_posterior
 from failuretwin.inference.engine.runs import has_rows
+from failuretwin.inference.engine.weighing import assembled
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.posterior import Posterior, compute_posterior
@@ -30,11 +32,19 @@ def shared_posterior(
         priors: Beliefs about faults and set-ups.
         in_doubt: Whether their sensor may be displaced.
     """
+    moving = likelihood.evidence.on_the_way
+    if moving.any() and not moving.all():
+        kinds = [np.flatnonzero(moving == kind) for kind in (False, True)]
+        parts = [shared_posterior(likelihood.alike(k), hypotheses, priors, in_doubt) for k in kinds]
+        place = np.empty(len(moving), dtype=np.int64)
+        for rows in kinds:
+            place[rows] = np.arange(len(rows))
+        return assembled(likelihood, parts, moving.astype(np.int64), place)
     if not any(has_rows(h) for h in hypotheses):
         return compute_posterior(likelihood, hypotheses, priors)
     if in_doubt:
         return displaced_posterior(likelihood, hypotheses, priors)
     unknown = layout_of(likelihood.model).offsets or likelihood.model.sensors.in_doubt
-    if unknown or isinstance(likelihood.evidence.movements, Stretches):
+    if unknown or moving.any():
         return robot_posterior(likelihood, hypotheses, priors)
     return compute_posterior(likelihood, hypotheses, priors)
