@@ -1,0 +1,175 @@
+"""Runs that never rest: their moments in closed form, their evidence, and what is found of them."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+import failuretwin as ft
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.movements import Stretches
+from failuretwin.core.runs import RunTable, concatenate, truth_of
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.arm_classes import generic_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.robot import load_robot
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.inference.engine.moments import LATE_RATE, moments_of
+from failuretwin.inference.engine.posterior import theta_posterior
+from failuretwin.inference.engine.registration import robot_weighing
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.on_the_way import SHARE, on_the_way
+
+ROBOT = load_robot("armpi_fpv")
+STEP_S = 0.01
+WITHOUT_REST = RandomMovements(count=6, period_s=1.2, ramp_shares=(1.0,))
+
+
+def exact_run(command, late_s):
+    """One run of an arm that follows its command (time, motor) exactly, so much later."""
+    time = STEP_S * np.arange(len(command))
+    seen = np.stack([np.interp(time - late_s, time, one) for one in command.T], axis=-1)
+    measured = np.full((len(time), 3), np.nan)
+    measured[::10] = DigitalTwin(ROBOT).path(seen[::10])
+    table = RunTable(
+        run=["run"],
+        motor=ROBOT.motor_names,
+        time=time,
+        command=command[None],
+        measured=measured[None],
+        measured_rate_hz=10.0,
+        attributes={"robot": ROBOT.name, "source": "simulated"},
+    )
+    return table.to_dataset()
+
+
+def zigzag(seconds=6.0):
+    """Ramps of 1.2 s from target to target, none with a rest."""
+    time = STEP_S * np.arange(round(seconds / STEP_S) + 1)
+    ends = np.arange(0.0, seconds + 1.2, 1.2)
+    targets = np.random.default_rng(4).uniform(-0.7, 0.7, (len(ends), 4))
+    targets[0] = 0.0
+    return np.stack([np.interp(time, ends, one) for one in targets.T], axis=-1)
+
+
+def curve(seconds=8.0):
+    """A smooth curve through random points."""
+    time = STEP_S * np.arange(round(seconds / STEP_S) + 1)
+    at = np.arange(0.0, seconds + 1.0, 0.9)
+    points = np.random.default_rng(7).uniform(-0.7, 0.7, (len(at), 4))
+    return CubicSpline(at, points)(time)
+
+
+def model():
+    return HealthyModel.of(load_calibration("generic", ROBOT))
+
+
+def moments(runs):
+    """The run as the engine sees it."""
+    healthy = model()
+    evidence = Evidence(runs, healthy.settings, healthy.sensors).sound
+    return healthy, on_the_way(evidence, healthy)
+
+
+def test_stretches_of_ramps_are_those_of_the_command():
+    command, healthy = zigzag(), model()
+    _, seen = moments(exact_run(command, 0.0))
+    stretches = seen.movements
+    assert isinstance(stretches, Stretches)
+    assert seen.usable.all()
+    assert stretches.whole.all()
+    time = STEP_S * np.arange(len(command))
+    at = seen.begin[0] - healthy.lag_s
+    wanted = np.stack([np.interp(at, time, one) for one in command.T], axis=-1)
+    np.testing.assert_allclose(stretches.target[0], wanted, atol=1e-6)
+    np.testing.assert_allclose(at - stretches.start[0], SHARE * 1.2, atol=0.06)
+    begin = np.stack([np.interp(stretches.start[0], time, one) for one in command.T], axis=-1)
+    np.testing.assert_allclose(stretches.origin()[0], begin, atol=1e-6)
+    # the reading is late enough before the corner for the speed to be that of the ramp
+    np.testing.assert_allclose(
+        stretches.speed[0], (wanted - begin) / (at - stretches.start[0])[:, None], atol=1e-6
+    )
+
+
+def test_points_of_an_arm_without_lag_are_those_of_the_command():
+    healthy = model()
+    for command in (zigzag(), curve()):
+        _, seen = moments(exact_run(command, healthy.lag_s))
+        expected = healthy.sensors.expected(seen.movements.target[0])[0]
+        rounded = 0.0015  # readings lie at the nearest time of the grid
+        assert np.abs(seen.point[0] - expected)[seen.usable[0]].max() < rounded
+
+
+def test_a_curve_has_a_moment_every_second_and_loses_no_command():
+    healthy, seen = moments(exact_run(curve(), 0.0))
+    assert seen.usable.sum() == 8
+    assert not seen.movements.whole.any()
+    found = moments_of(healthy.without_doubt, seen)
+    assert not found.lost[np.isfinite(found.log_weight)].any()
+    assert found.kept[0, 0] == 0.0
+    assert (found.kept[0, 1:] == found.kept[0, 1]).all()
+    assert 0.0 < found.kept[0, 1] < 1.0
+
+
+def test_a_ramp_may_be_lost_or_not_have_begun():
+    healthy, seen = moments(exact_run(zigzag(), 0.0))
+    found = moments_of(healthy.without_doubt, seen)
+    waits = found.lost[0, 1].all(axis=-1) & np.isfinite(found.log_weight[0, 1])
+    assert waits.sum() == 1
+    share = np.exp(found.log_weight[0, 1] - np.logaddexp.reduce(found.log_weight[0, 1]))
+    assert share[waits][0] == pytest.approx(LATE_RATE, rel=0.15)
+    np.testing.assert_allclose(found.base[0, 1][waits][0], found.origin[0, 1])
+
+
+@pytest.mark.parametrize("more_s", [-0.04, 0.0, 0.04])
+def test_the_lag_is_found_and_is_no_fault(more_s):
+    runs = exact_run(curve(), model().lag_s + more_s)
+    healthy, seen = moments(runs)
+    weighing = robot_weighing(
+        RunLikelihood(seen, healthy), paper_hypotheses(ROBOT.motor_names), ft.Priors()
+    )
+    mean, covariance = theta_posterior(weighing.evidence)
+    lags = weighing.layout.lags
+    deviation = np.sqrt(np.diag(covariance[0]))[lags]
+    assert (np.abs(mean[0, lags] - more_s) < 2.5 * deviation).all()
+    assert mean[0, lags].mean() == pytest.approx(more_s, abs=0.015)
+    assert weighing.posterior().log_posterior[0].argmax() == 0
+
+
+@pytest.fixture(scope="module")
+def never_at_rest():
+    usual = generic_imperfections(ROBOT)
+    return simulate(
+        Plan(ROBOT, runs_per_class=3, seed=11, imperfections=usual, movements=WITHOUT_REST)
+    )
+
+
+def test_runs_without_a_rest_are_diagnosed(never_at_rest):
+    found = ft.diagnose(never_at_rest, ROBOT, "generic")
+    right = np.array(
+        [d.diagnosis == truth for d, truth in zip(found, truth_of(never_at_rest), strict=True)]
+    )
+    truth = np.array(truth_of(never_at_rest))
+    assert right[truth == "healthy"].all()
+    assert right[[t.endswith("stuck") for t in truth]].sum() >= 11
+    assert right.sum() >= 20  # of 27
+    sure = [max(d.posterior.values()) > 0.99 for d in found]
+    assert not (np.array(sure) & ~right).any()
+
+
+def test_who_leaves_the_way_aside_cannot_tell(never_at_rest):
+    some = never_at_rest.isel(run=slice(2))
+    found = ft.BayesDiagnoser(ROBOT, "generic", whole_run=False).diagnose(some)
+    assert max(max(d.posterior.values()) for d in found) < 0.9
+
+
+def test_runs_that_rest_are_judged_as_without_those_that_do_not(never_at_rest):
+    usual = generic_imperfections(ROBOT)
+    rests = simulate(Plan(ROBOT, ["healthy", "motor_2:stuck"], 2, seed=3, imperfections=usual))
+    alone = ft.diagnose(rests, ROBOT, "generic")
+    both = ft.diagnose(concatenate([rests, never_at_rest.isel(run=slice(2))]), ROBOT, "generic")
+    for one, other in zip(alone, both, strict=False):
+        assert one.diagnosis == other.diagnosis
+        assert one.probability == pytest.approx(other.probability, abs=1e-6)
