@@ -503,13 +503,18 @@ def test_unseen_sessions_are_left_with_the_scatter_alone(settle, armpi):
         assert entry.gain - 1.96 * entry.gain_error > 0.5
 
 
-def test_gain_is_the_mean_difference_of_log_densities(settle, armpi, twin):
-    part = fit_settling(settle(TYPICAL, seed=12))
+@pytest.fixture(scope="module")
+def typical(settle):
+    """A fit to one session of a typical robot."""
+    return fit_settling(settle(TYPICAL, seed=12, movements=80))
+
+
+def test_gain_is_the_mean_difference_of_log_densities(settle, typical, armpi, twin):
     seen = settle(TYPICAL, seed=13, movements=40)
-    entry = judge(seen, part, armpi, "other day")
+    entry = judge(seen, typical, armpi, "other day")
     kind = HealthyModel.of(twin, generic_imperfections(armpi))
     generic = replace(kind.settling, scatter=tuple(kind.scatter))
-    gain = log_densities(seen, part.settling, armpi, twin) - log_densities(
+    gain = log_densities(seen, typical.settling, armpi, twin) - log_densities(
         seen, generic, armpi, twin
     )
     assert entry.movements == 40
@@ -532,10 +537,9 @@ def log_densities(seen, settling, robot, twin):
     )
 
 
-def test_a_shift_of_the_whole_session_counts_as_error(settle, armpi, twin):
-    part = fit_settling(settle(TYPICAL, seed=12))
+def test_a_shift_of_the_whole_session_counts_as_error(settle, typical, armpi):
     shifted = replace(TYPICAL, bias=tuple(np.add(TYPICAL.bias, 0.03)))
-    entry = judge(settle(shifted, seed=13), part, armpi, "shifted")
+    entry = judge(settle(shifted, seed=13), typical, armpi, "shifted")
     np.testing.assert_allclose(entry.after, 0.03 * 1.4826, rtol=0.15)
     assert entry.gain < 0.0
 
@@ -548,9 +552,7 @@ def test_a_fit_to_another_robot_does_not_beat_none(settle, armpi):
     assert entry.gain + 1.96 * entry.gain_error < 0.0
 
 
-def test_one_session_or_one_movement_judges_nothing(settle, armpi):
-    seen = settle(TYPICAL, seed=16)
-    part = fit_settling(seen)
-    assert cross_validate(part, armpi) == ()
+def test_one_session_or_one_movement_judges_nothing(settle, typical, armpi):
+    assert cross_validate(typical, armpi) == ()
     one = settle(TYPICAL, seed=16, movements=1)
-    assert judge(one, part, armpi, "short") is None
+    assert judge(one, typical, armpi, "short") is None
