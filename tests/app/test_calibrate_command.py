@@ -188,13 +188,13 @@ def test_the_page_works_with_the_tool_path_alone(failuretwin, data, armpi, tmp_p
     """And without the runs that are labelled faulty."""
     logs = [data / "real_robot_b_20241003" / label for label in ("label_0", "label_3")]
     labelled = ReadOptions("measured", published_labels=True)
-    runs = read_runs(logs, armpi, labelled).drop_vars("position")
+    runs = read_runs(logs, armpi, labelled).drop_vars("position").isel(run=slice(None, None, 2))
     save_run_set(runs, tmp_path / "tool.nc")
     answer = failuretwin(
         *("calibrate", "tool.nc", "--out", "twin.toml", "--report", REPORT), folder=tmp_path
     )
     assert answer.returncode == 0, answer.stderr
-    assert "10 runs: labelled motor_3:stuck" in answer.stdout
+    assert "5 runs: labelled motor_3:stuck" in answer.stdout
     assert "not checked on unseen logs" in answer.stdout
     page = Page((tmp_path / REPORT / "index.html").read_text())
     words = " ".join(page.words)

@@ -257,9 +257,8 @@ def test_results_need_no_truth_where_runs_tell_it(evaluate):
 def test_truth_may_come_from_raw_sessions(failuretwin, write_session, tmp_path):
     write_session(tmp_path / "logs" / "20240101_label_0", seed=1)
     write_session(tmp_path / "logs" / "20240102_label_3", seed=2)
-    told = failuretwin(
-        *("diagnose", "logs", "--published-labels", "--json", "told.jsonl"), folder=tmp_path
-    )
+    among = ("--hypotheses", "healthy,motor_3:stuck", "--json", "told.jsonl")
+    told = failuretwin("diagnose", "logs", "--published-labels", *among, folder=tmp_path)
     assert told.returncode == 0, told.stderr
     records = [json.loads(line) for line in (tmp_path / "told.jsonl").read_text().splitlines()]
     untold = "".join(json.dumps({**r, "truth": None}) + "\n" for r in records)

@@ -117,14 +117,14 @@ def test_what_all_runs_say_of_each_is_written_too(request, runs, tmp_path, way):
 
 
 def test_runs_of_two_robots_are_noticed_on_the_way(armpi, tmp_path):
-    """Eight healthy runs of a robot, then eight of one whose motors 2 and 3 are 2.3 degrees off."""
+    """Six healthy runs of a robot, then six of one whose motors 2 and 3 are 2.3 degrees off."""
     other = replace(ROBOT, bias=(0.0, -0.02, 0.04, 0.0))
     made = [
-        simulate(Plan(armpi, ["healthy"], 8, seed, Imperfections("made up", "test", settling=own)))
+        simulate(Plan(armpi, ["healthy"], 6, seed, Imperfections("made up", "test", settling=own)))
         for seed, own in enumerate((ROBOT, other))
     ]
     for name, some in zip(("a.nc", "b.nc"), made, strict=True):
-        save_run_set(some.assign_coords(run=[f"{name[0]}{i}" for i in range(8)]), tmp_path / name)
+        save_run_set(some.assign_coords(run=[f"{name[0]}{i}" for i in range(6)]), tmp_path / name)
     one = diagnose(tmp_path / "a.nc", "--track")
     assert "two robots" not in one.output
     both = diagnose(tmp_path / "a.nc", tmp_path / "b.nc", "--track")

@@ -67,7 +67,7 @@ def test_the_same_runs_get_the_same_diagnoses(cells, data, armpi, twin):
     diagnoser = BayesDiagnoser(twin)
 
     from_cells, from_logs = (
-        diagnoser.diagnose(runs.isel(run=slice(None, None, 3))) for runs in (cells, raw)
+        diagnoser.diagnose(runs.isel(run=slice(None, None, 5))) for runs in (cells, raw)
     )
 
     assert [d.truth for d in from_cells] == [d.truth for d in from_logs]

@@ -66,9 +66,9 @@ def test_imperfect_runs_are_diagnosed(diagnoses):
 
 
 def test_runs_of_the_published_twin_are_diagnosed(twin, armpi):
-    runs = simulate(Plan(armpi, paper_hypotheses(armpi.motor_names), 4, 2))
+    runs = simulate(Plan(armpi, paper_hypotheses(armpi.motor_names), 2, 2))
     found = BayesDiagnoser(twin).diagnose(runs)
-    assert sum(d.truth == d.diagnosis for d in found) >= 0.92 * 36
+    assert sum(d.truth == d.diagnosis for d in found) >= 0.92 * 18
 
 
 def test_command_and_measured_are_enough(twin, few, diagnoses):
@@ -89,37 +89,35 @@ def test_command_and_measured_are_enough(twin, few, diagnoses):
         assert (diagnosis.truth, diagnosis.quality) == (None, known.quality)
 
 
-def test_readings_of_motors_change_nothing_and_are_left_as_they_are(twin, few, told_of_few):
+def test_readings_of_motors_and_the_truth_change_nothing(twin, few, told_of_few):
     rng = np.random.default_rng(0)
     noise = {
         name: (("run", "time", "motor"), rng.normal(size=few["command"].shape))
         for name in ("position", "temperature", "voltage")
     }
     wrong = {n: few[n] + 1.0 for n in ("target", "ramp_duration", "movement_start", "magnitude")}
-    scrambled = few.assign(noise | wrong)
+    lied = few["fault"].values[::-1].copy()
+    scrambled = few.assign(noise | wrong | {"fault": ("run", lied)})
     before = scrambled.copy(deep=True)
-    assert BayesDiagnoser(twin).diagnose(scrambled) == told_of_few
+    expected = [
+        dataclasses.replace(d, truth=truth) for d, truth in zip(told_of_few, lied, strict=True)
+    ]
+    assert BayesDiagnoser(twin).diagnose(scrambled) == expected
     xr.testing.assert_identical(scrambled, before)
 
 
-def test_the_truth_is_passed_on_and_not_looked_at(twin, few, told_of_few):
-    lied = few.assign(fault=("run", few["fault"].values[::-1].copy()))
-    fooled = BayesDiagnoser(twin).diagnose(lied)
-    assert [d.truth for d in fooled] == [d.truth for d in told_of_few][::-1]
-    np.testing.assert_array_equal(posteriors(fooled), posteriors(told_of_few))
-
-
 def test_a_run_is_judged_alone(monkeypatch, twin, few, told_of_few):
-    backwards = BayesDiagnoser(twin).diagnose(few.isel(run=slice(None, None, -1)))
+    one_of_each = few.isel(run=slice(None, None, 2))
+    backwards = BayesDiagnoser(twin).diagnose(one_of_each.isel(run=slice(None, None, -1)))
     twice = few.isel(run=[3, 3, 11]).assign_coords(run=["a", "b", "c"])
     again = BayesDiagnoser(twin).diagnose(twice)
     monkeypatch.setattr(bayes, "CHUNK_RUNS", 1)
-    singly = BayesDiagnoser(twin).diagnose(few)
+    singly = BayesDiagnoser(twin).diagnose(one_of_each)
 
     expected = posteriors(told_of_few)
-    np.testing.assert_allclose(posteriors(backwards)[::-1], expected, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(posteriors(backwards)[::-1], expected[::2], rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(posteriors(again), expected[[3, 3, 11]], rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(posteriors(singly), expected, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(posteriors(singly), expected[::2], rtol=1e-9, atol=1e-15)
 
 
 def test_stuck_angle_is_found(imperfect, diagnoses):
@@ -213,7 +211,8 @@ def test_verdicts_say_what_was_found(diagnoses):
 
 @pytest.mark.parametrize("onset_s", [None, 0.49, 3.0])
 def test_finer_quadrature_changes_no_posterior(monkeypatch, twin, few, onset_s):
-    diagnoser = BayesDiagnoser(twin, priors=priors_of(twin.robot, None, onset_s))
+    priors = dataclasses.replace(priors_of(twin.robot, None, onset_s), setup=SetupPrior.known())
+    diagnoser = BayesDiagnoser(twin, priors=priors)
     one_of_each = few.isel(run=slice(None, None, 2))
     coarse = posteriors(diagnoser.diagnose(one_of_each))
     monkeypatch.setattr(stuck, "COARSE_NODES", 601)
@@ -249,7 +248,7 @@ def test_a_single_hypothesis_is_certain(twin, few):
 
 
 def test_known_onset_helps_and_is_reported(twin, imperfect, diagnoses):
-    rows = [i for i, d in enumerate(diagnoses) if "stuck" in d.truth]
+    rows = [i for i, d in enumerate(diagnoses) if "stuck" in d.truth][::2]
     runs = imperfect.isel(run=rows)
     found = BayesDiagnoser(twin, priors=priors_of(twin.robot, None, 0.49)).diagnose(runs)
 
@@ -305,12 +304,10 @@ def test_hypothesis_that_cannot_be_weighed_is_refused(twin, hypothesis, message)
         )
 
 
-def test_hypotheses_may_be_given_as_text(twin, few):
+def test_hypotheses_may_be_given_as_text(twin):
     texts = ["healthy", "motor_3:stuck", "motor_1:stuck+motor_2:drift"]
     told = BayesDiagnoser(twin, hypotheses=texts)
     assert told.hypothesis_set == tuple(Hypothesis.parse(text) for text in texts)
-    first = told.diagnose(few.isel(run=[0]))
-    assert first == BayesDiagnoser(twin, hypotheses=told.hypothesis_set).diagnose(few.isel(run=[0]))
 
 
 @pytest.mark.parametrize(

@@ -75,11 +75,11 @@ def test_any_mode_can_be_weighed_in_short_runs(armpi, twin, kind, count):
     check(BayesDiagnoser(twin, imperfections, weighed, priors).diagnose(simulate(plan)))
 
 
-def test_runs_of_sixty_movements_are_diagnosed(armpi, twin):
+def test_runs_of_forty_movements_are_diagnosed(armpi, twin):
     """Faults for sure; of a healthy run, a motor may always have got stuck at the very end."""
     known = load_calibration(None, armpi).imperfections
     faults = paper_hypotheses(armpi.motor_names)[::4]
-    runs = simulate(Plan(armpi, faults, 1, 3, known, RandomMovements(count=60)))
+    runs = simulate(Plan(armpi, faults, 1, 3, known, RandomMovements(count=40)))
     found = BayesDiagnoser(twin, known).diagnose(runs)
     check(found)
     assert [d.diagnosis for d in found] == [d.truth for d in found]

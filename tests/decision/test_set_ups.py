@@ -158,8 +158,8 @@ def test_a_log_that_fits_is_judged_as_if_no_set_up_was_asked(twin, runs, as_told
     ["motor 2 and motor 3 are swapped", "y of the tool", "millimetres", "degrees"],
 )
 def test_a_mistake_is_named_and_the_diagnosis_goes_on(twin, runs, as_told, words):
-    found = BayesDiagnoser(twin).diagnose(made(twin.robot, words).runs(runs.isel(run=[0, 1])))
-    same_verdicts(found, as_told[:2])
+    found = BayesDiagnoser(twin).diagnose(made(twin.robot, words).runs(runs.isel(run=[1])))
+    same_verdicts(found, as_told[1:2])
     assert all(words in remarks(d)[0] and "does not fit" in remarks(d)[0] for d in found)
 
 

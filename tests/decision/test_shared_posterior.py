@@ -33,6 +33,7 @@ from failuretwin.inference.theta.shared_unknowns import registered_evidence
 KNOWN = Imperfections("made up", "test", settling=replace(SETTLING, tail_dof=5.0))
 DOUBTED = replace(KNOWN, variation=DOUBT)
 TRUTHS = ["healthy", "motor_2:stuck", "motor_3:steady_state_error"]
+NAMES = ["healthy", *(f"motor_{k}:{m}" for k in (2, 3) for m in ("stuck", "steady_state_error"))]
 UNSURE, SURE = Priors(), Priors(setup=SetupPrior.known())
 STAND, NOISE = "the sensor does not seem to stand where the profile says", "noisier than is known"
 SHIFT = np.array([0.003, -0.004, 0.0])
@@ -118,7 +119,7 @@ def test_where_no_hypothesis_has_a_score_all_is_taken_as_told(twin, runs, in_dou
 )
 def test_verdicts_stand_and_the_set_up_is_told(twin, runs, off, imperfections):
     there = moved(runs, **off)
-    found = BayesDiagnoser(twin, imperfections).diagnose(there)
+    found = BayesDiagnoser(twin, imperfections, NAMES).diagnose(there)
     assert right(found)
     for k, diagnosis in enumerate(found):
         (line,) = remark(diagnosis)

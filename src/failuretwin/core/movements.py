@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import blake2b
 from itertools import pairwise
 from typing import Annotated
 
@@ -178,8 +179,14 @@ def find_movements(command: FloatArray, time: FloatArray) -> Movements:
             "`command` holds values that are not finite. Expected an angle [rad] at every "
             "sample; hold the last command where a run has ended."
         )
-    none = Movements.empty(run=0, movement=0, motor=command.shape[2])
-    return stack_movements([none, *(_movements_of_run(run, time) for run in command)])
+    found: dict[bytes, Movements] = {}  # by digest of the command: runs often repeat a motion
+    parts = [Movements.empty(run=0, movement=0, motor=command.shape[2])]
+    for run in command:
+        key = blake2b(run.tobytes()).digest()
+        if key not in found:
+            found[key] = _movements_of_run(run, time)
+        parts.append(found[key])
+    return stack_movements(parts)
 
 
 @dataclass(frozen=True)

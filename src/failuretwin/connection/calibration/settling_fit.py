@@ -299,8 +299,8 @@ def sense_remarks(part: SettlingFit, robot: Robot) -> list[str]:
     """
     loaded = np.flatnonzero(largest_load(robot, 0.0) > 1e-6)
     elsewhere = _far_if_turned(part, robot)
-    best, odds = _best_senses(part, robot, loaded[~elsewhere[loaded]].tolist())
-    sag = _largest_sag(part, best)
+    best, fit, odds = _best_senses(part, robot, loaded[~elsewhere[loaded]].tolist())
+    sag = np.abs(np.asarray(fit.settling.compliance) * largest_load(best, part.payload))
     remarks = []
     for k, motor in enumerate(robot.motors):
         sense = best.motors[k].sense
@@ -340,29 +340,22 @@ def _far_if_turned(part: SettlingFit, robot: Robot) -> BoolArray:
     return np.asarray(np.median(turned, axis=-1) > ELSEWHERE * np.median(away(robot)))
 
 
-def _largest_sag(part: SettlingFit, robot: Robot) -> FloatArray:
-    """Return how far each motor gives way under its largest load, as fitted, (motor,) [rad]."""
-    compliance = np.asarray(_refit(part, robot, part.payload).settling.compliance)
-    return np.asarray(np.abs(compliance) * largest_load(robot, part.payload))
-
-
 def _best_senses(
     part: SettlingFit, robot: Robot, loaded: Sequence[int]
-) -> tuple[Robot, dict[int, float]]:
-    """Return the robot with the senses that fit best, and how much worse each other way is [nats].
+) -> tuple[Robot, SettlingFit, dict[int, float]]:
+    """Return the robot with the senses that fit best, its fit, and how much worse others are.
 
     The sense that gains most is turned first: a wrong one bends the loads of the motors before it,
     and makes theirs look wrong too.
     """
-    best, posterior = robot, part.log_posterior
+    best, fit = robot, part
     while True:
-        turned = {
-            k: _refit(part, _with_turned(best, k), part.payload).log_posterior for k in loaded
-        }
-        k = max(turned, key=lambda motor: turned[motor], default=None)
-        if k is None or turned[k] - posterior <= SURE_NATS:
-            return best, {motor: posterior - other for motor, other in turned.items()}
-        best, posterior = _with_turned(best, k), turned[k]
+        turned = {k: _refit(part, _with_turned(best, k), part.payload) for k in loaded}
+        ahead = {k: fit.log_posterior - other.log_posterior for k, other in turned.items()}
+        k = min(ahead, key=lambda motor: ahead[motor], default=None)
+        if k is None or -ahead[k] <= SURE_NATS:
+            return best, fit, ahead
+        best, fit = _with_turned(best, k), turned[k]
 
 
 def _with_turned(robot: Robot, index: int) -> Robot:
