@@ -2,6 +2,7 @@
 
     python benchmarks/never_at_rest.py [--robot armpi_fpv ur5e so101 panda] [--motion blended ...]
         [--rate 10] [--calibration generic] [--healthy 20] [--faulty 3] [--clock 0.0]
+    python benchmarks/never_at_rest.py --logs FOLDER [--share 0.85] [--calibration armpi_fpv]
 
 Five motions, ten seconds each: point to point without a stop, sinusoids, splines as of a leader
 arm, set points at 125 Hz, pick and place in a loop. Each run is of another robot, drawn from what
@@ -18,11 +19,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import xarray as xr
 from scipy.interpolate import CubicSpline
 from telling import nats, right
 
 import failuretwin as ft
 from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import RunTable, Truth, concatenate
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.arm_classes import generic_imperfections
@@ -36,6 +39,8 @@ from failuretwin.inference.observation.healthy_model import HealthyModel
 STEP_S, DURATION_S = 0.008, 10.0
 DELAY_S, LAG_S = (0.0, 0.05), (0.02, 0.05)
 """Ranges of dead time and lag that robots are drawn from [s]."""
+LAG_OF_LOGS_S = 0.05
+"""Lag of the motors behind their commands in the logs [s]."""
 STIFFNESS = 0.4
 """Deviation of the logarithm of compliances that robots are drawn from."""
 WANDER_S = 1.0
@@ -215,6 +220,32 @@ def _sensed(
     return measured
 
 
+def without_rests(runs: xr.Dataset, share: float | None) -> xr.Dataset:
+    """Return runs with the readings of the ramps alone, or one of each at a share of its time."""
+    time, measured = runs["time"].values, runs["measured"].values.copy()
+    movements = find_movements(runs["command"].values, time)
+    kept = np.zeros(measured.shape[:2], dtype=bool)
+    for run, m in np.argwhere(movements.exists):
+        begin = movements.start[run, m] + LAG_OF_LOGS_S
+        length = movements.ramp_duration[run, m].max()
+        seen = np.isfinite(measured[run]).all(axis=-1)
+        here = np.flatnonzero(seen & (time > begin) & (time < begin + length))
+        if share is not None and len(here):
+            here = here[[np.argmin(np.abs(time[here] - begin - share * length))]]
+        kept[run, here] = True
+    measured[~kept] = np.nan
+    return runs.assign(measured=(runs["measured"].dims, measured))
+
+
+def of_logs(folder: str, share: float | None, calibration: str) -> None:
+    """Judge the labelled runs of a folder without their rests."""
+    robot = load_robot("armpi_fpv")
+    runs = ft.read_runs(folder, robot, ft.ReadOptions(published_labels=True))
+    began = clock.process_time()
+    found = ft.diagnose(without_rests(runs.load(), share), robot, calibration)
+    print(f"{calibration}: {line(found, clock.process_time() - began)}")
+
+
 def line(found: list[Diagnosis], seconds: float) -> str:
     """Return what was found of some runs."""
     healthy = [d for d in found if d.truth == "healthy"]
@@ -240,7 +271,12 @@ def main() -> None:
     parser.add_argument("--faulty", type=int, default=3)
     parser.add_argument("--clock", type=float, default=0.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--logs")
+    parser.add_argument("--share", type=float)
     given = parser.parse_args()
+    if given.logs:
+        of_logs(given.logs, given.share, given.calibration)
+        return
     for name in given.robot:
         robot = load_robot(name)
         for motion in given.motion:

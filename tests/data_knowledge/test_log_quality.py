@@ -142,8 +142,7 @@ NAMED = {
 WITHOUT_EVIDENCE = {
     "empty": (empty, "holds no readings of the tool"),
     "frozen": (frozen, "stands still though motors are told to move"),
-    "never at rest": (never_at_rest, "not seen at rest after any movement"),
-    "cut early": (lambda r: cut(r, 0.5), "not seen at rest after any movement"),
+    "cut early": (lambda r: cut(r, 0.5), "only 1 movement can be used"),
 }
 
 
@@ -170,6 +169,13 @@ def test_a_log_without_evidence_gets_no_verdict(clean, twin, name):
     assert words in diagnosis.verdict
     assert diagnosis.diagnosis is diagnosis.probability is None
     assert max(diagnosis.posterior.values()) == pytest.approx(1 / 9)
+
+
+def test_a_log_without_rests_is_judged_on_the_way(clean, twin):
+    (diagnosis,) = BayesDiagnoser(twin).diagnose(never_at_rest(clean))
+
+    assert diagnosis.diagnosis == "healthy"
+    assert diagnosis.method.startswith("bayes, readings on the way")
 
 
 def test_a_spoilt_log_never_makes_a_healthy_arm_look_surely_faulty(clean, twin):

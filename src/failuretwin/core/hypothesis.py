@@ -186,10 +186,12 @@ class MovementEvidence:
     Attributes:
         movement: Its number in the run, from 1.
         nats: Log Bayes factor of the most probable hypothesis over the second.
+        time_s: When it was seen, where one of several readings on its way is meant [s].
     """
 
     movement: int
     nats: float
+    time_s: float | None = None
 
 
 @dataclass(frozen=True)

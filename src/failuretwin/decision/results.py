@@ -170,4 +170,7 @@ def _csv_row(diagnosis: Diagnosis) -> dict[str, Any]:
         elif key not in ("posterior", "evidence"):
             row[key] = "; ".join(value) if isinstance(value, list) else value
     row |= {f"p({name})": p for name, p in diagnosis.posterior.items()}
-    return row | {f"nats({e.movement})": e.nats for e in diagnosis.evidence}
+    for item in diagnosis.evidence:
+        name = f"nats({item.movement})"
+        row[name] = row.get(name, 0.0) + item.nats
+    return row

@@ -225,12 +225,12 @@ def _evidence_lines(
     best, second = plain_name(ranked[0]), plain_name(ranked[1])
     lines = []
     for item in evidence:
+        when = "" if item.time_s is None else f", {item.time_s:.1f} s"
+        where = f"movement {item.movement}{when}"
         if item.nats >= TELLING_NATS:
-            lines.append(f"movement {item.movement}: {item.nats:.1f} nats for {best} over {second}")
+            lines.append(f"{where}: {item.nats:.1f} nats for {best} over {second}")
         elif item.nats <= -TELLING_NATS:
-            lines.append(
-                f"movement {item.movement}: {-item.nats:.1f} nats for {second} over {best}"
-            )
+            lines.append(f"{where}: {-item.nats:.1f} nats for {second} over {best}")
     return lines
 
 
@@ -261,21 +261,26 @@ LIKELY = 0.5
 
 
 def lost_command_lines(
-    outcome_probability: FloatArray, lost: BoolArray, motors: Sequence[str], faulty: Sequence[str]
+    outcome_probability: FloatArray,
+    numbers: Sequence[int],
+    lost: BoolArray,
+    motors: Sequence[str],
+    faulty: Sequence[str],
 ) -> list[str]:
     """Return the commands of a run that seem not to have arrived, a line each.
 
     Args:
         outcome_probability: Probability of each outcome, (movement, outcome).
+        numbers: The movements' numbers in the run, (movement,).
         lost: Motors that lose their command in it, (outcome, motor).
         motors: Names of the motors.
         faulty: Motors whose fault is told anyway.
     """
     lines = []
-    for movement, share in enumerate(outcome_probability):
+    for number, share in zip(numbers, outcome_probability, strict=True):
         missing = share @ lost > LIKELY
         told = [m for m, gone in zip(motors, missing, strict=True) if gone and m not in faulty]
         if told:
             names = " and ".join(motor.replace("_", " ") for motor in told)
-            lines.append(f"movement {movement + 1}: {names} did not get the command")
+            lines.append(f"movement {number}: {names} did not get the command")
     return lines

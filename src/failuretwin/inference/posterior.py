@@ -364,6 +364,7 @@ class Posterior:
         posterior = self.posterior(run, undecided)
         unused = unused_movements(evidence, run)
         used = "settled poses" if self.likelihood.moving is None else "whole run"
+        used = "readings on the way" if evidence.on_the_way[run] else used
         used += "" if model.sensors.tool_alone else f", by {'+'.join(model.sensing)}"
         diagnosis = Diagnosis(
             run=name,
@@ -383,7 +384,7 @@ class Posterior:
         if not undecided:
             diagnosis = replace(diagnosis, evidence=self._evidence(run, order, place))
             estimate = best.estimate(run)
-            losses = self._losses(estimate, ranked[0])
+            losses = self._losses(run, estimate, ranked[0])
             diagnosis = _with_estimate(diagnosis, ranked[0], estimate, place, robot)
         return with_joint_names(worded(diagnosis, ranked, losses, class_name(robot)), robot)
 
@@ -394,18 +395,28 @@ class Posterior:
         if len(order) < 2:
             return ()
         best, second = (self.weights[i].by_movement(run) for i in order[:2])
-        usable = np.flatnonzero(self.likelihood.evidence.usable[run])
+        evidence = self.likelihood.evidence
+        usable, number = np.flatnonzero(evidence.usable[run]), evidence.numbers[run]
+        again = np.bincount(number[usable])
         return tuple(
-            MovementEvidence(place.movements + int(m) + 1, float(best[m] - second[m]))
+            MovementEvidence(
+                place.movements + int(number[m]),
+                float(best[m] - second[m]),
+                float(evidence.end[run, m]) if again[number[m]] > 1 else None,
+            )
             for m in usable
         )
 
-    def _losses(self, estimate: Estimate, hypothesis: Hypothesis) -> list[str]:
+    def _losses(self, run: int, estimate: Estimate, hypothesis: Hypothesis) -> list[str]:
         """Return the commands that seem not to have arrived if `hypothesis` is true."""
         motors = self.likelihood.model.twin.robot.motor_names
         faulty = [fault.motor for fault in hypothesis.faults]
         return lost_command_lines(
-            estimate.outcome_probability, self.likelihood.model.lost_commands.lost, motors, faulty
+            estimate.outcome_probability,
+            self.likelihood.evidence.numbers[run].tolist(),
+            self.likelihood.model.lost_commands.lost,
+            motors,
+            faulty,
         )
 
 

@@ -199,6 +199,13 @@ class SettledEvidence(ArrayStruct):
             return self.movements.on_the_way
         return np.zeros(len(self.usable), dtype=bool)
 
+    @property
+    def numbers(self) -> IntArray:
+        """Number of each movement in its run, from 1, (run, movement)."""
+        if isinstance(self.movements, Stretches):
+            return self.movements.movement + 1
+        return np.broadcast_to(1 + np.arange(self.usable.shape[1]), self.usable.shape)
+
     def alike(self, runs: IntArray) -> SettledEvidence:
         """Return some runs that are all seen at rest, or all on the way."""
         some = self[runs]
@@ -393,10 +400,13 @@ def _spread_out(time: FloatArray, least_step: float) -> IntArray:
 def unused_movements(evidence: SettledEvidence, run: int) -> list[str]:
     """Return why movements of a run are not used, a line each."""
     lines = []
+    on_the_way = bool(evidence.on_the_way[run])
     for movement in np.flatnonzero(evidence.movements.exists[run] & ~evidence.usable[run]):
-        if evidence.moving[run, movement]:
+        if on_the_way:
+            reason = "no reading at rest or on its way"
+        elif evidence.moving[run, movement]:
             reason = "the tool does not come to rest"
         else:
             reason = "no reading while the tool is at rest"
-        lines.append(f"movement {movement + 1} not used: {reason}")
+        lines.append(f"movement {evidence.numbers[run, movement]} not used: {reason}")
     return lines

@@ -27,6 +27,8 @@ SHARE = 0.85
 before the next command may have come."""
 APART_S = 1.0
 """Time from one moment on the way to the next [s]; nearer readings share one lag."""
+MOST_MOMENTS = 20
+"""Moments of a run at most, unless it has more movements: the work grows with their square."""
 POOLED_S = 0.12
 """Readings this near to that of a moment are pooled with it [s]."""
 STANDS_S = 0.12
@@ -105,7 +107,8 @@ class _Looks:
             length, share = stood, 1.0
         else:
             length, share = min(longest, end - start - lag), SHARE
-        count = max(1, round(length / APART_S))
+        most = max(1, MOST_MOMENTS // int(movements.exists[run].sum()))
+        count = min(max(1, round(length / APART_S)), most)
         wanted = start + lag + length * (np.arange(count) + share) / count
         nearest = np.unique(np.argmin(np.abs(time[seen] - wanted[:, None]), axis=1))
         found, before = [], start
