@@ -70,7 +70,7 @@ def differences(model, base, direction, step=1e-5):
 
 def found_columns(model, base, direction):
     pose = model.settle(base, direction, np.zeros(4, dtype=bool))
-    return columns(model, pose, direction, Layout(4, geometry=False))
+    return columns(model, pose, direction, np.zeros_like(pose), Layout(4, geometry=False))
 
 
 def test_columns_are_the_derivative_of_where_the_tool_is_seen(twin):

@@ -29,6 +29,8 @@ APART_S = 1.0
 """Time from one moment on the way to the next [s]; nearer readings share one lag."""
 MOST_MOMENTS = 20
 """Moments of a run at most, unless it has more movements: the work grows with their square."""
+MOST_RESTS = 1
+"""Rests of a run that is judged on its way: an arm that never stops does so at the end."""
 POOLED_S = 0.12
 """Readings this near to that of a moment are pooled with it [s]."""
 STANDS_S = 0.12
@@ -63,8 +65,8 @@ class _Moment:
 def on_the_way(evidence: Evidence, model: HealthyModel) -> SettledEvidence:
     """Return settled positions, and moments on the way of runs that hardly rest.
 
-    Of a run in which half of the movements or more were seen at rest, that is what
-    `Evidence.settled` says: where motors settle is known better than how they get there.
+    Of a run with more than `MOST_RESTS`, or with any of a robot whose timing is calibrated, that is
+    what `Evidence.settled` says: where motors settle is known better than how they get there.
 
     Args:
         evidence: What the runs say.
@@ -72,7 +74,10 @@ def on_the_way(evidence: Evidence, model: HealthyModel) -> SettledEvidence:
     """
     settled = evidence.settled
     exists, usable = settled.movements.exists, settled.usable
-    hardly = 2 * usable.sum(axis=1) < exists.sum(axis=1)
+    rests = usable.sum(axis=1)
+    most = 0 if model.knows_timing else MOST_RESTS
+    hardly = (rests <= most) & (2 * rests < exists.sum(axis=1))
+    hardly &= [not quality.fatal for quality in evidence.quality]
     unseen = exists & ~usable & hardly[:, None]
     if not model.sensors.tool_alone or not unseen.any():
         return settled
