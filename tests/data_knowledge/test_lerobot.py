@@ -129,7 +129,7 @@ def test_the_guessed_map_leads_to_a_verdict(tmp_path):
     guess, result = run(), run()
 
     assert guess.returncode == 2
-    assert "low = [-110.0, -100.0, -96.8, -95.0, -159.9]" in guess.stdout
+    assert "low = [-110.0079, -99.9811, -96.8299, -94.9964, -159.8552]" in guess.stdout
     assert result.returncode == 0, result.stderr
     assert "pick/episode_000000" in result.stdout
 
