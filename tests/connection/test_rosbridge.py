@@ -15,25 +15,11 @@ from failuretwin.connection.links.ros_messages import DiagnosticsWriter
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
-from fake_rosbridge import FakeRosbridge
 from roscores import free_port
 from waiting import WAIT_S, wait_for
 
 pytest.importorskip("roslibpy")
 TOPICS = RosTopics(position="", tool="/tool", commands_late_s=1.0)
-
-
-@pytest.fixture
-def server():
-    fake = FakeRosbridge(free_port())
-    yield fake
-    fake.stop()
-
-
-@pytest.fixture
-def transport(server):
-    with rosbridge.RosbridgeTransport("127.0.0.1", server.port) as opened:
-        yield opened
 
 
 def point(t):

@@ -20,10 +20,7 @@ from failuretwin.connection.links.base import OK, Answer, CommandSent, Order, Re
 from failuretwin.connection.links.ros_link import RosCommander, RosSink, RosSource
 from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosWriter
 from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.connection.links.rosbridge import RosbridgeTransport
 from failuretwin.core.hypothesis import Diagnosis
-from fake_rosbridge import FakeRosbridge
-from roscores import free_port
 from waiting import WAIT_S, wait_for
 
 pytest.importorskip("roslibpy")
@@ -43,19 +40,6 @@ CALLS = {
 """Fields of each operation, beside `op` and `id`, that servers read."""
 TIMES = {1: [{"secs", "nsecs"}], 2: [{"secs", "nsecs"}, {"sec", "nanosec"}]}
 NUMBERS = {"string": str, "bool": bool}
-
-
-@pytest.fixture
-def server():
-    fake = FakeRosbridge(free_port())
-    yield fake
-    fake.stop()
-
-
-@pytest.fixture
-def transport(server):
-    with RosbridgeTransport("127.0.0.1", server.port) as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module", params=[1, 2], ids=["ROS 1", "ROS 2"])

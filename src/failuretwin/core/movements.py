@@ -7,7 +7,7 @@ then a plateau until the next movement. Angles are in the log's sense.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 from itertools import pairwise
 from typing import Annotated
@@ -132,6 +132,18 @@ class Stretches(Movements):
     whole: Annotated[BoolArray, Axes("run", "movement", empty=True)]
     curved: Annotated[BoolArray, Axes("run", "movement", empty=False)]
     movement: Annotated[IntArray, Axes("run", "movement", empty=0)]
+
+    @classmethod
+    def of(cls, movements: Movements) -> Stretches:
+        """Return movements as stretches that end at rest; stretches as they are."""
+        if isinstance(movements, Stretches):
+            return movements
+        runs, count, motors = movements.target.shape
+        found = cls.empty(run=runs, movement=count, motor=motors)
+        found.movement[:] = np.arange(count)
+        found.beginning[:] = movements.origin()
+        known = ("initial", "target", "ramp_duration", "start")
+        return replace(found, **{name: getattr(movements, name) for name in known})
 
     def origin(self) -> FloatArray:
         """Return the reference at the start of each stretch, (run, movement, motor) [rad]."""

@@ -34,9 +34,7 @@ def highest_and_outlier(likelihood: RunLikelihood) -> tuple[FloatArray, FloatArr
     """
     model, evidence = likelihood.model, likelihood.evidence
     healthy = likelihood.findings.expected[:, :, 0]
-    scatter = model.scatter
-    if isinstance(evidence.movements, Stretches):
-        scatter = model.scatter_at(evidence.movements)
+    scatter = model.scatter_at(Stretches.of(evidence.movements))
     _, _, spread = model.residual(evidence.point, healthy, scatter)
     highest = np.where(likelihood.usable, spread.log_norm(model.settling.tail_dof), 0.0)
     return highest, np.where(likelihood.usable, model.outlier_log_density, 0.0)

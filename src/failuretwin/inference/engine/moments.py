@@ -89,15 +89,16 @@ def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
     usual = model.outcomes_as_seen(evidence)
     density = model.explain(evidence, usual).density
     outcomes = model.filtered_outcomes(evidence, usual, density)
-    movements = evidence.movements
+    movements = Stretches.of(evidence.movements)
     target, origin = np.nan_to_num(movements.target), np.nan_to_num(movements.origin())
-    if isinstance(movements, Stretches):  # a command is lost as a whole
-        part = ~(movements.whole | movements.at_rest)[..., None] & outcomes.lost.any(axis=-1)
-        possible = np.where(part, -np.inf, outcomes.log_weight)
-        outcomes = replace(outcomes, log_weight=possible)
+    part = ~movements.whole[..., None] & outcomes.lost.any(axis=-1)  # lost as a whole, or not
+    outcomes = replace(outcomes, log_weight=np.where(part, -np.inf, outcomes.log_weight))
     chosen, kept = _likeliest(outcomes)
     base, direction, weight = kept
-    lost = outcomes.lost[chosen]
+    lost, way = outcomes.lost[chosen], ~movements.at_rest & movements.exists
+    speed, bend = (
+        np.where(lost, 0.0, values[:, :, None]) for values in (movements.speed, movements.bend)
+    )
     found = Moments(
         point=evidence.point,
         usable=evidence.usable,
@@ -111,52 +112,30 @@ def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
         lost=lost,
         log_weight=weight,
         outcome=chosen,
-        speed=np.zeros_like(base),
-        late=np.zeros_like(base),
-        done=np.ones_like(target),
-        kept=np.zeros(target.shape[:2]),
+        speed=speed,
+        late=(speed * model.start_jitter_s) ** 2 + bend**2,
+        done=movements.done,
+        kept=_kept(movements, way),
     )
-    if isinstance(movements, Stretches):
-        late = model.late(movements, evidence.first_reading_delay)
-        return _on_the_way(found, movements, late, model.start_jitter_s)
-    return found
+    late = np.maximum(model.late(movements, evidence.first_reading_delay), LATE_RATE)
+    return _with_waiting(found, np.where(way & movements.whole, late, 0.0))
 
 
-def _on_the_way(
-    moments: Moments, stretches: Stretches, late: FloatArray, jitter_s: float
-) -> Moments:
-    """Return moments of which some are on the way.
-
-    Where a stretch is all that is seen of a movement, its motors may not have set out yet, all of
-    them: one outcome more.
+def _kept(stretches: Stretches, way: BoolArray) -> FloatArray:
+    """Return how probable it is that what became of the moment before holds on, (run, moment).
 
     Args:
-        moments: As if all were at rest.
         stretches: The movements.
-        late: Probability that each started late, (run, movement).
-        jitter_s: Deviation of when a motor starts [s].
+        way: Which are seen on the way, (run, movement).
     """
-    way = ~stretches.at_rest & stretches.exists
-    kept, same = np.zeros(way.shape), way[:, 1:]
-    same = same & (stretches.movement[:, 1:] == stretches.movement[:, :-1])
+    kept = np.zeros(way.shape)
+    same = way[:, 1:] & (stretches.movement[:, 1:] == stretches.movement[:, :-1])
     kept[:, 1:] = np.where(same, np.where(stretches.curved[:, 1:], KEPT_ON_CURVES, 1.0), 0.0)
-    speed, bend = (
-        np.where(moments.lost, 0.0, values[:, :, None])
-        for values in (stretches.speed, stretches.bend)
-    )
-    found = replace(
-        moments,
-        speed=speed,
-        late=(speed * jitter_s) ** 2 + bend**2,
-        done=stretches.done,
-        kept=kept,
-    )
-    waits = way & stretches.whole
-    return _with_waiting(found, np.where(waits, np.maximum(late, LATE_RATE), 0.0))
+    return kept
 
 
 def _with_waiting(moments: Moments, late: FloatArray) -> Moments:
-    """Return moments with one outcome more: that no motor has set out yet.
+    """Return moments with one outcome more, if it can be: that no motor has set out yet.
 
     Args:
         moments: Without it.

@@ -195,16 +195,12 @@ class SettledEvidence(ArrayStruct):
     @property
     def on_the_way(self) -> BoolArray:
         """Which runs have readings on the way in place of rests, (run,)."""
-        if isinstance(self.movements, Stretches):
-            return self.movements.on_the_way
-        return np.zeros(len(self.usable), dtype=bool)
+        return Stretches.of(self.movements).on_the_way
 
     @property
     def numbers(self) -> IntArray:
         """Number of each movement in its run, from 1, (run, movement)."""
-        if isinstance(self.movements, Stretches):
-            return self.movements.movement + 1
-        return np.broadcast_to(1 + np.arange(self.usable.shape[1]), self.usable.shape)
+        return Stretches.of(self.movements).movement + 1
 
     def alike(self, runs: IntArray) -> SettledEvidence:
         """Return some runs that are all seen at rest, or all on the way."""

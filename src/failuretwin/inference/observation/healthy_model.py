@@ -382,8 +382,8 @@ class HealthyModel:
         total = np.logaddexp(log_sum(terms, axis=-1), self.outlier_log_density)
         trust = np.where(usable, np.exp(terms.max(axis=-1) - total), 0.0)
         scatter = at_best(found.poses) - self.settle(base, direction, self.none_held)
-        if isinstance(evidence.movements, Stretches):  # on the way a lag looks like scatter
-            trust = np.where(evidence.movements.at_rest, trust, 0.0)
+        at_rest = Stretches.of(evidence.movements).at_rest  # on the way a lag looks like scatter
+        trust = np.where(at_rest, trust, 0.0)
         return Standing(outcomes.lost[best], base, trust[..., None] * scatter)
 
     def explain(self, evidence: SettledEvidence, outcomes: CommandOutcomes) -> Explanation:

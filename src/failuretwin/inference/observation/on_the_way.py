@@ -48,7 +48,6 @@ CURVED_RAD = 0.01
 class _Moment:
     """One stretch of one run; see `Stretches`."""
 
-    movement: int
     start: float
     time: float
     point: FloatArray
@@ -145,7 +144,6 @@ class _Looks:
         lasted = (time[at] - self.model.lag_s - begin) / (1.0 - early)
         ramp = np.maximum(self.evidence.settled.movements.ramp_duration[run, m], 1e-3)
         return _Moment(
-            m,
             begin,
             time[at],
             path[-1] + off,
@@ -230,8 +228,6 @@ def _put(made: SettledEvidence, stretches: Stretches, at: tuple[int, int], momen
 
 def beside(moving: TransientSamples, moments: SettledEvidence) -> TransientSamples:
     """Return readings on the way without those of moments, movement by movement of these."""
-    stretches = moments.movements
-    if not isinstance(stretches, Stretches):
-        return moving
+    stretches = Stretches.of(moments.movements)
     runs = np.arange(len(stretches.movement))[:, None]
     return moving[runs, stretches.movement].where(stretches.at_rest & stretches.exists)
