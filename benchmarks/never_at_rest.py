@@ -27,7 +27,7 @@ import failuretwin as ft
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import RunTable, Truth, concatenate
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import vary
 from failuretwin.digital_model.robot import Robot, load_robot
@@ -147,7 +147,7 @@ def cases(robot: Robot, healthy: int, faulty: int, seed: int) -> Iterator[Case]:
 def simulated(robot: Robot, motion: Path, case: Case, rate: float, late: float) -> RunTable:
     """Return one run of a robot of its own."""
     rng = np.random.default_rng([case.seed, len(robot.motors)])
-    time = STEP_S * np.arange(round(DURATION_S / STEP_S) + 1)
+    time = as_floats(STEP_S * np.arange(round(DURATION_S / STEP_S) + 1))
     (command, strokes), motors = motion(robot, time, rng), len(robot.motors)
     usual = generic_imperfections(robot)
     settling = vary(usual, rng).settling or Settling.ideal(motors)
