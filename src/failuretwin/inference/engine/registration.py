@@ -218,15 +218,16 @@ def _suspect(
 
 # The posterior of runs in chunks, each about the better of two registrations.
 
-CHUNK_RUNS = 16
-"""Runs that are weighed at a time: columns of all rows and outcomes stay below 100 MB."""
+CHUNK_ROWS = 1600
+"""Moments of all runs that are weighed at a time, times those of a run: rows grow with them, and
+columns of all rows and outcomes stay below 100 MB."""
 
 
 def robot_posterior(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> Posterior:
     """Return the posterior of runs whose sensor is where the profile says."""
-    chunks = _chunks(len(likelihood.usable))
+    chunks = _chunks(likelihood)
     parts = _robot_parts(likelihood, hypotheses, priors)
     return assembled(likelihood, [one.posterior() for one in parts], *_in_turn(chunks))
 
@@ -253,7 +254,7 @@ def evidence_at_once(
 def _robot_parts(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> list[Weighing]:
-    chunks = _chunks(len(likelihood.usable))
+    chunks = _chunks(likelihood)
     return [robot_weighing(likelihood[rows], hypotheses, priors) for rows in chunks]
 
 
@@ -263,7 +264,7 @@ def displaced_posterior(
     """Return the posterior of runs whose sensor may be displaced."""
     parts, better = _about_the_better(likelihood, hypotheses, priors)
     some = [one.posterior() for one in parts]
-    chunks = _chunks(len(likelihood.usable))
+    chunks = _chunks(likelihood)
     part, row = _in_turn(chunks)
     return assembled(likelihood, some, part + len(chunks) * better, row)
 
@@ -291,7 +292,7 @@ def _about_the_better(
     parts = [
         displaced_weighing(likelihood[rows], hypotheses, priors, where[rows])
         for where in places
-        for rows in _chunks(runs)
+        for rows in _chunks(likelihood)
     ]
     if len(places) == 1:
         return parts, np.zeros(runs, dtype=np.int64)
@@ -299,11 +300,13 @@ def _about_the_better(
     return parts, np.argmax(total, axis=0)
 
 
-def _chunks(runs: int) -> list[IntArray]:
-    return [np.arange(at, min(at + CHUNK_RUNS, runs)) for at in range(0, runs, CHUNK_RUNS)]
+def _chunks(likelihood: RunLikelihood) -> list[IntArray]:
+    runs, moments = likelihood.usable.shape
+    some = max(1, CHUNK_ROWS // max(moments, 1) ** 2)
+    return [np.arange(at, min(at + some, runs)) for at in range(0, runs, some)]
 
 
 def _in_turn(chunks: Sequence[IntArray]) -> tuple[IntArray, IntArray]:
     """Return the chunk and the place in it of each run."""
-    part, row = np.divmod(np.concatenate(chunks), CHUNK_RUNS)
-    return part, row
+    sizes = [len(one) for one in chunks]
+    return np.repeat(np.arange(len(sizes)), sizes), np.concatenate([np.arange(n) for n in sizes])
