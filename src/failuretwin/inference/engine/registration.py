@@ -32,9 +32,8 @@ from failuretwin.inference.engine.weighing import Weighing, assembled
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.posterior import Posterior, compute_posterior, marginal_likelihoods
+from failuretwin.inference.posterior import Posterior, marginal_likelihoods
 from failuretwin.inference.set_ups.setup_prior import SetupPrior
-from failuretwin.inference.theta.shared_unknowns import layout_of as offsets_in_doubt
 
 COARSE_TO_FINE = (0.026, 0.004, 0.0)
 """Noise added while a displaced sensor is registered, as shares of the reach."""
@@ -179,10 +178,7 @@ def sensor_in_doubt(
         return False
     settled = replace(likelihood, moving=None)
     told = [*ranked, *(h for h in hypotheses if len(h.faults) > 1)]
-    if offsets_in_doubt(settled.model).offsets or settled.evidence.on_the_way.any():
-        found = robot_posterior(settled, told, priors).log_posterior
-    else:
-        found = compute_posterior(settled, told, priors).log_posterior
+    found = robot_posterior(settled, told, priors).log_posterior
     best = np.argmax(found, axis=1)
     single = np.flatnonzero(best < len(ranked))
     return bool(len(single)) and _suspect(settled[single], ranked, priors, best[single])
