@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bz2
 import json
 import os
 import resource
@@ -31,8 +30,7 @@ from failuretwin.core.foreign import (
 )
 from failuretwin.core.hypothesis import parse_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.readers.bag_file import check_chunks
-from failuretwin.data_knowledge.readers.file_claims import check_matlab, check_npz
+from failuretwin.data_knowledge.readers.file_claims import check_matlab, check_npz, check_recording
 from failuretwin.data_knowledge.readers.matlab import export_runs, write_csv
 from failuretwin.data_knowledge.resumable import produce
 from failuretwin.data_knowledge.store import filling, load_run_set, replacing, save_run_set
@@ -277,34 +275,57 @@ def test_an_npz_archive_whose_header_claims_too_much(tmp_path):
         check_npz(path)
 
 
-def ros1_chunk(data, compression, claimed):
-    def record(fields, body):
-        head = b"".join(struct.pack("<I", len(f)) + f for f in fields)
-        return struct.pack("<I", len(head)) + head + struct.pack("<I", len(body)) + body
+def bag_of(path, data, compression):
+    """Write a ROS 1 bag with one chunk, and let it say that the chunk unfolds to 1000 bytes."""
+    rosbag1 = pytest.importorskip("rosbags.rosbag1")
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    bag = rosbag1.Writer(path)
+    bag.set_compression(bag.CompressionFormat[compression])
+    with bag:
+        bag.write(bag.add_connection("/odd", "std_msgs/msg/String", typestore=store), 0, data)
+    written = path.read_bytes()
+    at = written.index(b"size=") + len(b"size=")
+    path.write_bytes(written[:at] + struct.pack("<I", 1000) + written[at + 4 :])
 
-    fields = [b"op=\x05", b"compression=" + compression, b"size=" + struct.pack("<I", claimed)]
-    return b"#ROSBAG V2.0\n" + record([b"op=\x03"], b" " * 10) + record(fields, data)
 
-
-def test_a_bag_whose_chunk_unfolds_to_more_than_it_says(tmp_path, small_limit):
+@pytest.mark.parametrize("compression", ["BZ2", "LZ4"])
+def test_a_bag_whose_chunk_unfolds_to_more_than_it_says(tmp_path, small_limit, compression):
     path = tmp_path / "run.bag"
-    path.write_bytes(ros1_chunk(bz2.compress(bytes(20_000_000)), b"bz2", 1000))
-    assert path.stat().st_size < 2000
-    with pytest.raises(InputError, match="its messages would take 1"):
-        check_chunks(path)
-    with pytest.raises(InputError, match="its messages would take 1"):
-        read_runs(path)
+    bag_of(path, bytes(20_000_000), compression)
+    assert path.stat().st_size < 100_000
+    for read in (check_recording, read_runs):
+        with pytest.raises(InputError, match=r"its messages would take (16|20) MB"):
+            read(path)
 
 
-def test_an_mcap_file_whose_chunk_unfolds_to_more_than_it_says(tmp_path, small_limit):
-    lz4 = pytest.importorskip("lz4.frame")
-    data = lz4.compress(bytes(20_000_000))
-    record = struct.pack("<QQQI", 0, 0, 1000, 0) + struct.pack("<I", 3) + b"lz4"
+def mcap_chunk(data, compression):
+    name = compression.encode()
+    record = struct.pack("<QQQI", 0, 0, 1000, 0) + struct.pack("<I", len(name)) + name
     record += struct.pack("<Q", len(data)) + data
+    return b"\x89MCAP0\r\n\x06" + struct.pack("<Q", len(record)) + record
+
+
+@pytest.mark.parametrize("pieces", [1, 20])
+def test_an_mcap_file_whose_chunk_unfolds_to_more_than_it_says(tmp_path, small_limit, pieces):
+    """Also where the chunk is many frames, each of them small."""
+    lz4 = pytest.importorskip("lz4.frame")
+    data = lz4.compress(bytes(20_000_000 // pieces)) * pieces
     path = tmp_path / "run.mcap"
-    path.write_bytes(b"\x89MCAP0\r\n\x06" + struct.pack("<Q", len(record)) + record)
-    with pytest.raises(InputError, match="its messages would take 20 MB"):
-        check_chunks(path)
+    path.write_bytes(mcap_chunk(data, "lz4"))
+    with pytest.raises(InputError, match=r"its messages would take (16|20) MB"):
+        check_recording(path)
+
+
+def test_an_mcap_file_that_goes_on_after_its_end_is_refused(tmp_path):
+    writer = pytest.importorskip("mcap.writer").Writer(str(tmp_path / "run.mcap"))
+    writer.start(profile="ros2")
+    writer.finish()
+    path = tmp_path / "run.mcap"
+    check_recording(path)
+    path.write_bytes(path.read_bytes() * 2)
+    with pytest.raises(InputError, match="goes on after its end"):
+        check_recording(path)
 
 
 # Text of files

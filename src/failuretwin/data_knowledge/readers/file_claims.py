@@ -7,18 +7,20 @@ the memory is refused by `check_size`, whatever else it holds.
 
 from __future__ import annotations
 
+import bz2
 import json
 import math
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import IO, TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from failuretwin.core.errors import InputError
-from failuretwin.core.foreign import LEAST_BYTES, check_size, read_text, reading
+from failuretwin.core.errors import InputError, needs_extra
+from failuretwin.core.foreign import LEAST_BYTES, MB, check_size, read_text, reading
 
 if TYPE_CHECKING:
     import h5py
@@ -224,3 +226,60 @@ def check_npz(path: Path) -> None:
                 shape, _, dtype = read(file)
                 total += max(float(math.prod(shape)) * dtype.itemsize, float(entry.file_size))
             check_size(total, path, "its arrays")
+
+
+# Recordings of ROS: a kilobyte of a compressed chunk can unfold to gigabytes, whatever the record
+# beside it says, so each chunk is unfolded in steps that are thrown away.
+
+STEP_BYTES = 16 * MB
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+Unfold = Callable[[IO[bytes]], IO[bytes]]
+"""Opens a compressed file."""
+
+
+def check_recording(path: Path) -> None:
+    """Raise InputError if the chunks of a ROS 1 bag or an MCAP file unfold to too much."""
+    with path.open("rb") as file:
+        is_mcap = file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+        file.seek(0)
+        if not is_mcap and path.suffix != ".bag":
+            return
+        total = 0
+        for unfold, data in (_mcap_chunks if is_mcap else _ros1_chunks)(file, path):
+            with unfold(BytesIO(data)) as chunk:
+                while part := chunk.read(STEP_BYTES):
+                    total += len(part)
+                    check_size(total, path, "its messages")
+
+
+def _ros1_chunks(file: IO[bytes], path: Path) -> Iterator[tuple[Unfold, bytes]]:
+    import lz4.frame
+    from rosbags.rosbag1 import Reader
+
+    unfold: dict[Any, Unfold] = {bz2.decompress: bz2.open, lz4.frame.decompress: lz4.frame.open}
+    with Reader(path) as bag:
+        for chunk in bag.chunks.values():
+            file.seek(chunk.datapos)
+            yield unfold.get(chunk.decompressor, _as_it_is), file.read(chunk.datasize)
+
+
+def _mcap_chunks(file: IO[bytes], path: Path) -> Iterator[tuple[Unfold, bytes]]:
+    with needs_extra(f"{path}: MCAP files need mcap", "files"):
+        from mcap.records import Chunk
+        from mcap.stream_reader import StreamReader
+    import lz4.frame
+
+    try:
+        from compression import zstd
+    except ImportError:
+        from backports import zstd
+    unfold: dict[str, Unfold] = {"lz4": lz4.frame.open, "zstd": zstd.open}
+    for record in StreamReader(file, emit_chunks=True).records:
+        if isinstance(record, Chunk):
+            yield unfold.get(record.compression, _as_it_is), record.data
+    if file.read(1):
+        raise InputError(f"{path}: goes on after its end. Record or copy it again.")
+
+
+def _as_it_is(file: IO[bytes]) -> IO[bytes]:
+    return file
