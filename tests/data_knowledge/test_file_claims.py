@@ -11,6 +11,7 @@ import subprocess
 import sys
 import zipfile
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ import scipy.io
 
 from failuretwin import read_runs
 from failuretwin.core import foreign
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.foreign import (
     EXPANSION,
     LEAST_BYTES,
@@ -29,6 +30,7 @@ from failuretwin.core.foreign import (
     read_text,
 )
 from failuretwin.core.hypothesis import parse_hypotheses
+from failuretwin.data_knowledge import store
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.readers.file_claims import check_matlab, check_npz, check_recording
 from failuretwin.data_knowledge.readers.matlab import export_runs, write_csv
@@ -364,34 +366,34 @@ def test_names_of_runs_are_quoted_in_csv(runs, tmp_path):
 # Work of processes that died
 
 
-@pytest.fixture
-def dead_process():
-    child = subprocess.Popen([sys.executable, "-c", ""])
-    child.wait()
-    return child.pid
-
-
-def test_unfinished_work_of_dead_processes_is_swept(tmp_path, dead_process, monkeypatch):
-    monkeypatch.setattr("socket.gethostname", lambda: "arm-1.lab")
+def test_unfinished_work_of_dead_processes_is_swept(tmp_path):
     file, folder = tmp_path / "out.jsonl", tmp_path / "plots"
-    old = tmp_path / f".out.jsonl.arm_1_lab-{dead_process}.partial.jsonl"
-    old_folder = tmp_path / f".plots.arm_1_lab-{dead_process}.partial"
-    kept = [
-        tmp_path / f".out.jsonl.arm_1_lab-{os.getppid()}.partial.jsonl",  # it lives
-        tmp_path / f".out.jsonl.arm_2-{dead_process}.partial.jsonl",  # of another machine
-        tmp_path / f".other.jsonl.arm_1_lab-{dead_process}.partial.jsonl",
-    ]
-    old_folder.mkdir()
-    for path in (old, old_folder / "a.png", *kept):
-        path.write_text("half")
+    (tmp_path / ".out.jsonl.partial.jsonl").write_text("half")
+    (tmp_path / ".plots.partial").mkdir()
+    (tmp_path / ".plots.partial" / "a.png").write_text("half")
+    (tmp_path / ".out.jsonl.lock").write_text("process 1 on arm-1")
     with replacing(file) as partial:
         partial.write_text("whole")
     with filling(folder) as partial:
         (partial / "b.png").write_text("whole")
-    assert not old.exists()
-    assert not old_folder.exists()
-    assert all(path.exists() for path in kept)
     assert file.read_text() == "whole"
+    assert [found.name for found in folder.iterdir()] == ["b.png"]
+    assert sorted(found.name for found in tmp_path.iterdir()) == ["out.jsonl", "plots"]
+
+
+def test_two_writers_of_a_file_wait_for_each_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "PATIENCE_S", 0.2)
+    path = tmp_path / "out.jsonl"
+    with replacing(path) as partial:
+        partial.write_text("first")
+        with pytest.raises(OutputError, match="is writing it"), replacing(path):
+            pass
+    assert path.read_text() == "first"
+    monkeypatch.setattr(store, "PATIENCE_S", 10.0)
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(lambda text: store.write_text(text, path), map(str, range(20))))
+    assert path.read_text() in map(str, range(20))
+    assert [found.name for found in tmp_path.iterdir()] == ["out.jsonl"]
 
 
 def test_matlab_exports_of_our_own_pass(runs, twin, tmp_path):
