@@ -14,8 +14,9 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Final
+from typing import IO, TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
@@ -23,7 +24,6 @@ from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.foreign import LEAST_BYTES, MB, check_size, read_text, reading
 
 if TYPE_CHECKING:
-    import h5py
     import zarr
 
 TEXT_CELL_BYTES = 64
@@ -40,7 +40,8 @@ def check_netcdf(path: Path) -> None:
 
     def weigh(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset):
-            _check_inside(path, name, item)
+            if item.external or item.is_virtual:
+                raise _elsewhere(path, name)
             cell = TEXT_CELL_BYTES if h5py.check_string_dtype(item.dtype) else item.dtype.itemsize
             largest = max(math.prod(item.shape or ()), math.prod(item.chunks or ()))
             found.append(float(largest) * cell)
@@ -48,16 +49,13 @@ def check_netcdf(path: Path) -> None:
     with h5py.File(path, "r") as file:
         for name in file:
             if isinstance(file.get(name, getlink=True), h5py.ExternalLink):
-                raise InputError(
-                    f"{path}: {name!r} lies in another file. Write all of it into one."
-                )
+                raise _elsewhere(path, name)
         file.visititems(weigh)
     check_size(sum(found), path, "its arrays")
 
 
-def _check_inside(path: Path, name: str, dataset: h5py.Dataset) -> None:
-    if dataset.external or dataset.is_virtual:
-        raise InputError(f"{path}: {name!r} lies in another file. Write all of it into one.")
+def _elsewhere(path: Path, name: str) -> InputError:
+    return InputError(f"{path}: {name!r} lies in another file. Write all of it into one.")
 
 
 # Zarr: a folder of chunks, with a JSON file for each array.
@@ -139,6 +137,7 @@ DEEPEST = 32
 """Cells within cells; published files have three."""
 ELEMENT_BYTES = 16
 """Largest memory of an element of a matrix: two doubles, or an object [bytes]."""
+Order = Literal["little", "big"]
 
 
 def check_matlab(path: Path) -> None:
@@ -147,67 +146,61 @@ def check_matlab(path: Path) -> None:
         data = path.read_bytes()
         if len(data) < HEADER_BYTES or data[126:128] not in (b"IM", b"MI"):
             raise InputError(f"{path}: is no MATLAB file. Save it with the option -v7.")
-        walk = _MatlabWalk(path, "little" if data[126:128] == b"IM" else "big")
-        walk.elements(memoryview(data)[HEADER_BYTES:], 0)
+        order: Order = "little" if data[126:128] == b"IM" else "big"
+        _weigh_elements(memoryview(data)[HEADER_BYTES:], order, path, 0.0, 0)
 
 
-class _MatlabWalk:
-    """Adds up what the matrices of a file claim, each of which has to lie within what holds it."""
+def _weigh_elements(data: memoryview, order: Order, path: Path, total: float, depth: int) -> float:
+    """Return `total` and what the matrices in a buffer claim [bytes]; each has to lie in it."""
+    if depth > DEEPEST:
+        raise InputError(f"{path}: holds cells within cells more than {DEEPEST} deep.")
+    for kind, body in _elements(data, order, path):
+        if kind == COMPRESSED:
+            total = _weigh_elements(_inflated(body, path, total), order, path, total, depth + 1)
+        elif kind == MATRIX:
+            total += _claim(body, order, path)
+            check_size(total, path, "its matrices")
+            total = _weigh_elements(body, order, path, total, depth + 1)
+    return total
 
-    def __init__(self, path: Path, order: Any) -> None:
-        self.path, self.order, self.total = path, order, 0.0
 
-    def elements(self, data: memoryview, depth: int) -> None:
-        """Go through the elements of a buffer."""
-        if depth > DEEPEST:
-            raise InputError(f"{self.path}: holds cells within cells more than {DEEPEST} deep.")
-        for kind, body in self._split(data):
-            if kind == COMPRESSED:
-                self.elements(self._inflated(body), depth + 1)
-            elif kind == MATRIX:
-                self._claim(body)
-                self.elements(body, depth + 1)
+def _elements(data: memoryview, order: Order, path: Path) -> Iterator[tuple[int, memoryview]]:
+    """Yield type and content of the elements in a buffer."""
+    at = 0
+    while at + 8 <= len(data):
+        kind = int.from_bytes(data[at : at + 4], order)
+        size, start = int.from_bytes(data[at + 4 : at + 8], order), at + 8
+        if kind >> 16:  # up to four bytes stand in the tag itself
+            kind, size, start = kind & 0xFFFF, kind >> 16, at + 4
+        if start + size > len(data) or (start == at + 4 and size > 4):
+            raise InputError(
+                f"{path}: an element claims {size} bytes where {len(data) - start} are left. The "
+                "file was cut off or changed: copy it again."
+            )
+        yield kind, data[start : start + size]
+        padding = 0 if kind == COMPRESSED else -size % 8
+        at = at + 8 if start == at + 4 else start + size + padding
 
-    def _split(self, data: memoryview) -> Iterator[tuple[int, memoryview]]:
-        at = 0
-        while at + 8 <= len(data):
-            kind, size = self._number(data[at : at + 4]), self._number(data[at + 4 : at + 8])
-            start = at + 8
-            if kind >> 16:  # up to four bytes stand in the tag itself
-                kind, size, start = kind & 0xFFFF, kind >> 16, at + 4
-            if start + size > len(data) or (start == at + 4 and size > 4):
-                raise InputError(
-                    f"{self.path}: an element claims {size} bytes where {len(data) - start} are "
-                    "left. The file was cut off or changed: copy it again."
-                )
-            yield kind, data[start : start + size]
-            padding = 0 if kind == COMPRESSED else -size % 8
-            at = at + 8 if start == at + 4 else start + size + padding
 
-    def _number(self, data: memoryview) -> int:
-        return int.from_bytes(data, self.order)
+def _inflated(data: memoryview, path: Path, total: float) -> memoryview:
+    limit = max(LEAST_BYTES, len(data))
+    inflate, parts, rest = zlib.decompressobj(), list[bytes](), bytes(data)
+    while rest and not inflate.eof:
+        parts.append(inflate.decompress(rest, limit))
+        rest = inflate.unconsumed_tail
+        total += len(parts[-1])
+        check_size(total, path, "what is compressed in it")
+    return memoryview(b"".join(parts))
 
-    def _inflated(self, data: memoryview) -> memoryview:
-        limit = max(LEAST_BYTES, len(data))
-        inflate, parts, size = zlib.decompressobj(), [], 0
-        rest = bytes(data)
-        while rest and not inflate.eof:
-            part = inflate.decompress(rest, limit)
-            rest = inflate.unconsumed_tail
-            size += len(part)
-            check_size(self.total + size, self.path, "what is compressed in it")
-            parts.append(part)
-        return memoryview(b"".join(parts))
 
-    def _claim(self, matrix: memoryview) -> None:
-        """Add what a matrix takes by its dimensions, the second of its elements."""
-        elements = self._split(matrix)
-        next(elements, None)
-        kind, body = next(elements, (0, memoryview(b"")))
+def _claim(matrix: memoryview, order: Order, path: Path) -> float:
+    """Return what a matrix takes by its dimensions, the second of its elements [bytes]."""
+    for kind, body in islice(_elements(matrix, order, path), 1, 2):
         if kind == INT32:
-            sizes = [self._number(body[i : i + 4]) for i in range(0, len(body) - 3, 4)]
-            self.total += float(math.prod(sizes)) * ELEMENT_BYTES
-            check_size(self.total, self.path, "its matrices")
+            whole = range(0, len(body) - 3, 4)
+            sizes = [int.from_bytes(body[i : i + 4], order) for i in whole]
+            return float(math.prod(sizes)) * ELEMENT_BYTES
+    return 0.0
 
 
 # npz: a ZIP archive of arrays, each with a header that says shape and type.
