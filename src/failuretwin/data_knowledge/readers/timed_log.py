@@ -7,7 +7,7 @@ units and in the sense of the robot's commands when they get here.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -138,20 +138,19 @@ def _distinct(log: TimedLog) -> TimedLog:
         InputError: If a part of it runs backwards in time.
     """
 
-    def last(samples: Samples | None) -> Samples | None:
-        if samples is None or len(samples.time) == 0:
-            return samples
+    def last(samples: Samples) -> Samples:
         _check_times(samples.time, log.name)
-        kept = np.append(np.diff(samples.time) > 0, True)
+        kept = np.diff(samples.time, append=np.inf) > 0
         return Samples(samples.time[kept], samples.value[kept])
 
-    command = log.command
-    if isinstance(command, Samples):
-        command = last(command) or command
-    else:
-        _check_times(command.time, log.name)
-    sensors = {name: last(samples) or samples for name, samples in log.sensors.items()}
-    return TimedLog(log.name, command, last(log.tool), last(log.position), sensors)
+    _check_times(log.command.time, log.name)
+    return replace(
+        log,
+        command=last(log.command) if isinstance(log.command, Samples) else log.command,
+        tool=None if log.tool is None else last(log.tool),
+        position=None if log.position is None else last(log.position),
+        sensors={name: last(samples) for name, samples in log.sensors.items()},
+    )
 
 
 def _check_commands(log: TimedLog) -> None:
