@@ -14,7 +14,7 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import ROUNDING_RAD, Movements
 from failuretwin.core.polyline import simplify_motors
-from failuretwin.core.runs import STEP_S, RunTable
+from failuretwin.core.runs import AXES, REQUIRED, STEP_S, VARIABLES, RunTable
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -68,10 +68,9 @@ def held(target: FloatArray) -> FloatArray:
 
 
 SHAPES: Mapping[str, tuple[int, ...]] = {
-    "tool_orientation": (3,),
-    "accelerometer": (3,),
-    "gyroscope": (3,),
-    "wire": (),
+    name: (len(AXES),) * (len(dims) - 2)
+    for name, (dims, _) in VARIABLES.items()
+    if dims[:2] == ("run", "time") and "motor" not in dims and name not in REQUIRED
 }
 """Channels of the sensors that a log may hold beside tool and motors; goals have one a motor."""
 
