@@ -367,7 +367,7 @@ def test_a_full_disk_leaves_nothing_behind(failuretwin, tmp_path, healthy):
 
 
 def test_a_real_log_is_corrected_and_read_again(failuretwin, tmp_path, teleoperated, so101):
-    from failuretwin.data_knowledge.lerobot_copy import write_shifted
+    from failuretwin.data_knowledge.readers.lerobot import write_shifted
 
     shift = np.zeros(6)
     shift[3] = 5.0  # about 5 deg of a range of 201

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bz2
 import json
 import os
 import resource
@@ -12,6 +11,7 @@ import subprocess
 import sys
 import zipfile
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ import scipy.io
 
 from failuretwin import read_runs
 from failuretwin.core import foreign
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.foreign import (
     EXPANSION,
     LEAST_BYTES,
@@ -30,9 +30,9 @@ from failuretwin.core.foreign import (
     read_text,
 )
 from failuretwin.core.hypothesis import parse_hypotheses
+from failuretwin.data_knowledge import store
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.readers.bag_file import check_chunks
-from failuretwin.data_knowledge.readers.file_claims import check_matlab, check_npz
+from failuretwin.data_knowledge.readers.file_claims import check_matlab, check_npz, check_recording
 from failuretwin.data_knowledge.readers.matlab import export_runs, write_csv
 from failuretwin.data_knowledge.resumable import produce
 from failuretwin.data_knowledge.store import filling, load_run_set, replacing, save_run_set
@@ -277,34 +277,57 @@ def test_an_npz_archive_whose_header_claims_too_much(tmp_path):
         check_npz(path)
 
 
-def ros1_chunk(data, compression, claimed):
-    def record(fields, body):
-        head = b"".join(struct.pack("<I", len(f)) + f for f in fields)
-        return struct.pack("<I", len(head)) + head + struct.pack("<I", len(body)) + body
+def bag_of(path, data, compression):
+    """Write a ROS 1 bag with one chunk, and let it say that the chunk unfolds to 1000 bytes."""
+    rosbag1 = pytest.importorskip("rosbags.rosbag1")
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    bag = rosbag1.Writer(path)
+    bag.set_compression(bag.CompressionFormat[compression])
+    with bag:
+        bag.write(bag.add_connection("/odd", "std_msgs/msg/String", typestore=store), 0, data)
+    written = path.read_bytes()
+    at = written.index(b"size=") + len(b"size=")
+    path.write_bytes(written[:at] + struct.pack("<I", 1000) + written[at + 4 :])
 
-    fields = [b"op=\x05", b"compression=" + compression, b"size=" + struct.pack("<I", claimed)]
-    return b"#ROSBAG V2.0\n" + record([b"op=\x03"], b" " * 10) + record(fields, data)
 
-
-def test_a_bag_whose_chunk_unfolds_to_more_than_it_says(tmp_path, small_limit):
+@pytest.mark.parametrize("compression", ["BZ2", "LZ4"])
+def test_a_bag_whose_chunk_unfolds_to_more_than_it_says(tmp_path, small_limit, compression):
     path = tmp_path / "run.bag"
-    path.write_bytes(ros1_chunk(bz2.compress(bytes(20_000_000)), b"bz2", 1000))
-    assert path.stat().st_size < 2000
-    with pytest.raises(InputError, match="its messages would take 1"):
-        check_chunks(path)
-    with pytest.raises(InputError, match="its messages would take 1"):
-        read_runs(path)
+    bag_of(path, bytes(20_000_000), compression)
+    assert path.stat().st_size < 100_000
+    for read in (check_recording, read_runs):
+        with pytest.raises(InputError, match=r"its messages would take (16|20) MB"):
+            read(path)
 
 
-def test_an_mcap_file_whose_chunk_unfolds_to_more_than_it_says(tmp_path, small_limit):
-    lz4 = pytest.importorskip("lz4.frame")
-    data = lz4.compress(bytes(20_000_000))
-    record = struct.pack("<QQQI", 0, 0, 1000, 0) + struct.pack("<I", 3) + b"lz4"
+def mcap_chunk(data, compression):
+    name = compression.encode()
+    record = struct.pack("<QQQI", 0, 0, 1000, 0) + struct.pack("<I", len(name)) + name
     record += struct.pack("<Q", len(data)) + data
+    return b"\x89MCAP0\r\n\x06" + struct.pack("<Q", len(record)) + record
+
+
+@pytest.mark.parametrize("pieces", [1, 20])
+def test_an_mcap_file_whose_chunk_unfolds_to_more_than_it_says(tmp_path, small_limit, pieces):
+    """Also where the chunk is many frames, each of them small."""
+    lz4 = pytest.importorskip("lz4.frame")
+    data = lz4.compress(bytes(20_000_000 // pieces)) * pieces
     path = tmp_path / "run.mcap"
-    path.write_bytes(b"\x89MCAP0\r\n\x06" + struct.pack("<Q", len(record)) + record)
-    with pytest.raises(InputError, match="its messages would take 20 MB"):
-        check_chunks(path)
+    path.write_bytes(mcap_chunk(data, "lz4"))
+    with pytest.raises(InputError, match=r"its messages would take (16|20) MB"):
+        check_recording(path)
+
+
+def test_an_mcap_file_that_goes_on_after_its_end_is_refused(tmp_path):
+    writer = pytest.importorskip("mcap.writer").Writer(str(tmp_path / "run.mcap"))
+    writer.start(profile="ros2")
+    writer.finish()
+    path = tmp_path / "run.mcap"
+    check_recording(path)
+    path.write_bytes(path.read_bytes() * 2)
+    with pytest.raises(InputError, match="goes on after its end"):
+        check_recording(path)
 
 
 # Text of files
@@ -343,34 +366,34 @@ def test_names_of_runs_are_quoted_in_csv(runs, tmp_path):
 # Work of processes that died
 
 
-@pytest.fixture
-def dead_process():
-    child = subprocess.Popen([sys.executable, "-c", ""])
-    child.wait()
-    return child.pid
-
-
-def test_unfinished_work_of_dead_processes_is_swept(tmp_path, dead_process, monkeypatch):
-    monkeypatch.setattr("socket.gethostname", lambda: "arm-1.lab")
+def test_unfinished_work_of_dead_processes_is_swept(tmp_path):
     file, folder = tmp_path / "out.jsonl", tmp_path / "plots"
-    old = tmp_path / f".out.jsonl.arm_1_lab-{dead_process}.partial.jsonl"
-    old_folder = tmp_path / f".plots.arm_1_lab-{dead_process}.partial"
-    kept = [
-        tmp_path / f".out.jsonl.arm_1_lab-{os.getppid()}.partial.jsonl",  # it lives
-        tmp_path / f".out.jsonl.arm_2-{dead_process}.partial.jsonl",  # of another machine
-        tmp_path / f".other.jsonl.arm_1_lab-{dead_process}.partial.jsonl",
-    ]
-    old_folder.mkdir()
-    for path in (old, old_folder / "a.png", *kept):
-        path.write_text("half")
+    (tmp_path / ".out.jsonl.partial.jsonl").write_text("half")
+    (tmp_path / ".plots.partial").mkdir()
+    (tmp_path / ".plots.partial" / "a.png").write_text("half")
+    (tmp_path / ".out.jsonl.lock").write_text("process 1 on arm-1")
     with replacing(file) as partial:
         partial.write_text("whole")
     with filling(folder) as partial:
         (partial / "b.png").write_text("whole")
-    assert not old.exists()
-    assert not old_folder.exists()
-    assert all(path.exists() for path in kept)
     assert file.read_text() == "whole"
+    assert [found.name for found in folder.iterdir()] == ["b.png"]
+    assert sorted(found.name for found in tmp_path.iterdir()) == ["out.jsonl", "plots"]
+
+
+def test_two_writers_of_a_file_wait_for_each_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "PATIENCE_S", 0.2)
+    path = tmp_path / "out.jsonl"
+    with replacing(path) as partial:
+        partial.write_text("first")
+        with pytest.raises(OutputError, match="is writing it"), replacing(path):
+            pass
+    assert path.read_text() == "first"
+    monkeypatch.setattr(store, "PATIENCE_S", 10.0)
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(lambda text: store.write_text(text, path), map(str, range(20))))
+    assert path.read_text() in map(str, range(20))
+    assert [found.name for found in tmp_path.iterdir()] == ["out.jsonl"]
 
 
 def test_matlab_exports_of_our_own_pass(runs, twin, tmp_path):

@@ -13,13 +13,12 @@ from failuretwin.app.inputs import stated_angles
 from failuretwin.connection.joint_offsets import JointOffset, joint_offsets
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import FAULTY_STATE, Diagnosis, Hypothesis
-from failuretwin.data_knowledge.lerobot_copy import NOTE_FILE, check_copy, write_shifted
 from failuretwin.data_knowledge.readers.lerobot import (
+    NOTE_FILE,
     STATE,
-    channel_names,
-    lerobot_info,
+    check_copy,
     read_lerobot,
-    state_channels,
+    write_shifted,
 )
 from failuretwin.data_knowledge.readers.lerobot_units import LeRobotAngles
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
@@ -112,10 +111,9 @@ def _corrected(
             f"{log}: nothing to correct: no joint offset has a probability of 95 % ({got}). "
             f"{out} was not written. Record more stops, or leave out --correct."
         )
-    known = read_lerobot(log, robot, angles).angles
-    info = lerobot_info(log)
-    names, per_rad = channel_names(info, STATE), known.per_rad(robot)
-    channels = state_channels(log, info, known, robot)
+    episodes = read_lerobot(log, robot, angles)
+    names, channels = episodes.channels, episodes.channel_of
+    per_rad = episodes.angles.per_rad(robot)
     shift, joints = np.zeros(len(names)), list[dict[str, Any]]()
     for offset in found:
         k = robot.motor_names.index(offset.motor)
@@ -127,7 +125,7 @@ def _corrected(
             "offset_90_deg": np.rad2deg(offset.interval_90).tolist(),
             "probability": offset.probability,
             "added": float(shift[channels[k]]),
-            "unit": known.unit,
+            "unit": episodes.angles.unit,
         })  # fmt: skip
     note = {"program": f"failuretwin {__version__}", "source": log.resolve().name, "column": STATE}
     write_shifted(log, out, shift, note | {"joints": joints})

@@ -15,7 +15,7 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
 from failuretwin.core.types import MS_PER_S, BoolArray, FloatArray, frozen_array
-from failuretwin.data_knowledge.readers.table import first_line, load_csv, numbers
+from failuretwin.data_knowledge.readers.table import Table, first_line
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.servo import ServoUnits
 
@@ -156,7 +156,7 @@ def read_step_test(path: Path, robot: Robot) -> list[StepTest]:
 
 def _read_table(path: Path) -> FloatArray:
     """Return the rows in order of their stamps, (row, 3): stamp, position, command."""
-    table = numbers(load_csv(path), ["timestamp", "position", "command"], path, gaps=False)
+    table = Table.read(path).numbers(["timestamp", "position", "command"], gaps=False)
     return table[np.argsort(table[:, 0], kind="stable")]
 
 

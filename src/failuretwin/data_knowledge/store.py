@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import socket
 import warnings
@@ -149,24 +148,17 @@ def replacing(path: Path) -> Iterator[Path]:
     """Give a path to write to; what stands there in the end takes the place of `path`.
 
     Raises:
-        OutputError: If writing fails for whatever reason of the disk; the unfinished work is
-            removed and `path` is as before.
+        OutputError: If writing fails for whatever reason of the disk, or another process writes
+            `path` all the while; the unfinished work is removed and `path` is as before.
     """
     if path.exists() and not (path.is_file() or path.is_dir()):
         yield path  # a pipe or a device: nothing there can be replaced
         return
+    check_writable(path)
     target = path.resolve()  # a link stays a link
-    partial = target.with_name(f".{path.name}.{_owner()}.partial{path.suffix}")
-    try:
-        check_writable(path)
-        _sweep(target.parent, path.name)
+    with _beside(target, path) as partial:
         yield partial
         atomic_replace(partial, target)
-    except (OSError, RuntimeError) as error:
-        raise _output_error(path, error) from error
-    finally:
-        with suppress(OSError):
-            shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
 
 
 def write_text(text: str, path: Path) -> None:
@@ -193,69 +185,55 @@ def filling(folder: Path) -> Iterator[Path]:
     """Give a folder to write files to; they appear in `folder` together or not at all.
 
     Raises:
-        OutputError: If writing fails; `folder` is as before.
+        OutputError: If writing fails, or another process fills `folder` all the while; `folder` is
+            as before.
     """
-    partial = folder.with_name(f".{folder.name}.{_owner()}.partial")
+    check_fillable(folder)
     made = [parent for parent in folder.parents if not parent.exists()]
     try:
-        check_fillable(folder)
-        _sweep(folder.parent, folder.name)
-        partial.mkdir(parents=True)
-        yield partial
-        if folder.exists():
-            for file in partial.iterdir():
-                file.replace(folder / file.name)
-        else:
-            partial.replace(folder)
-    except OSError as error:
-        shutil.rmtree(partial, ignore_errors=True)
+        with _beside(folder, folder) as partial:
+            partial.mkdir()
+            yield partial
+            if folder.exists():
+                for file in partial.iterdir():
+                    file.replace(folder / file.name)
+            else:
+                partial.replace(folder)
+    except OutputError:
         for parent in made:
             with suppress(OSError):
                 parent.rmdir()
-        raise _output_error(folder, error) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        raise
 
 
-def _owner() -> str:
-    """Return what tells unfinished work of this process from that of others."""
-    return f"{_host()}-{os.getpid()}"
+@contextmanager
+def _beside(target: Path, path: Path) -> Iterator[Path]:
+    """Give a hidden path beside `target` to its sole writer; nothing is left there in the end.
 
-
-def _host() -> str:
-    return re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())
-
-
-def _sweep(folder: Path, name: str) -> None:
-    """Remove unfinished work for `name` in a folder, of processes of this machine that are dead."""
-    pattern = re.compile(rf"\.{re.escape(name)}\.{_host()}-(\d+)\.partial.*")
-    for other in folder.iterdir() if folder.is_dir() else ():
-        match = pattern.fullmatch(other.name)
-        if match and not _alive(int(match.group(1))):
-            with suppress(OSError):
-                shutil.rmtree(other) if other.is_dir() else other.unlink()
-
-
-def _alive(process: int) -> bool:
-    """Return whether a process of this machine may still be running."""
-    if os.name != "posix":
-        return True  # asking would end it there
+    Raises:
+        OutputError: If the disk fails; the text names `path`.
+    """
+    partial = target.with_name(f".{target.name}.partial{path.suffix}")
     try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):
-        return True
-    return True
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with sole_writer(target, PATIENCE_S):
+            _remove(partial)  # of a process that died
+            try:
+                yield partial
+            finally:
+                _remove(partial)
+    except OutputError:
+        raise
+    except (OSError, RuntimeError) as error:
+        raise OutputError(
+            f"{path}: could not be written ({reason(error)}). Nothing was left behind; free some "
+            "space or choose another place."
+        ) from error
 
 
-def _output_error(path: Path, error: BaseException) -> OutputError:
-    if isinstance(error, OutputError):
-        return error
-    return OutputError(
-        f"{path}: could not be written ({reason(error)}). Nothing was left behind; free some "
-        "space or choose another place."
-    )
+def _remove(path: Path) -> None:
+    with suppress(OSError):
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def check_writable(path: Path) -> None:
@@ -288,12 +266,20 @@ def check_fillable(folder: Path) -> None:
 # One writer at a time: a lock that ends with the process that holds it.
 
 
+PATIENCE_S = 10.0
+"""Time that the writer of a file or folder waits for another one [s]."""
+
+
 @contextmanager
-def sole_writer(path: Path) -> Iterator[None]:
+def sole_writer(path: Path, patience_s: float = 0.0) -> Iterator[None]:
     """Hold the lock `.NAME.lock` beside `path`; nobody else can write `path` meanwhile.
 
     The system lets go of the lock when its process dies, however that happens, so the file of a
     dead process holds nobody back.
+
+    Args:
+        path: What is written.
+        patience_s: Time to wait for another writer [s].
 
     Raises:
         OutputError: If another process holds it, or if it cannot be made.
@@ -301,7 +287,7 @@ def sole_writer(path: Path) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
     file = path.with_name(f".{path.name}.lock")
-    lock = FileLock(file, timeout=0)
+    lock = FileLock(file, timeout=patience_s)
     try:
         lock.acquire()
     except Timeout as error:
@@ -315,7 +301,8 @@ def sole_writer(path: Path) -> Iterator[None]:
             file.write_text(f"process {os.getpid()} on {socket.gethostname()}")
         yield
     finally:
-        file.unlink(missing_ok=True)  # before letting go: nobody can lock a file that has no name
+        with suppress(OSError):  # before letting go: nobody can lock a file that has no name
+            file.unlink()
         lock.release()
 
 

@@ -11,12 +11,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.errors import InputError
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import MS_PER_S, FloatArray, IntArray, as_floats
 
@@ -71,6 +70,28 @@ FIELDS: dict[Kind, dict[str, str]] = {
 MONITORING = Kind.MONITORING
 STANDARD_TYPES = {kind.value.replace("/msg/", "/"): kind for kind in Kind if kind is not MONITORING}
 """Kinds of the standard types by their ROS 1 names."""
+
+
+GOAL_TOPIC = "/joint_goals"
+"""Topic of the goals that motors report, in our recordings."""
+
+
+@dataclass(frozen=True)
+class BagTopics:
+    """Which topics to read, where types and names of topics leave a choice.
+
+    Attributes:
+        command: Topic of the commands; None: the one that fits.
+        tool: Topic of the tool's position; None: the one that fits, if any.
+        position: Topic of the motor readings; None: the one that fits, if any.
+        goal: Topic of the goals that the motors report to have received; None: `GOAL_TOPIC`, if
+            there is one.
+    """
+
+    command: str | None = None
+    tool: str | None = None
+    position: str | None = None
+    goal: str | None = None
 
 
 def kind_of(fields: Mapping[str, str]) -> Kind | None:
@@ -315,113 +336,3 @@ def _joined(
         duration[at, columns] = np.nan if row.duration is None else row.duration
     timed = any(row.duration is not None for row in rows)
     return Rows(where, stamps, value, tuple(names), duration if timed else None, in_counts)
-
-
-# Which topic of a recording is what: commands, the tool's position, motor readings.
-
-EXPECTED: dict[Role, str] = {
-    "command": "no commands. Expected a JointTrajectory, or joint values on a topic that has "
-    "`command` or `position_monitoring` in its name",
-    "tool": "neither tool positions nor motor readings. Expected a PointStamped, PoseStamped or "
-    "JointState, or a topic `condition_monitoring`",
-    "position": "no motor readings. Expected a JointState or a topic `condition_monitoring`",
-    "goal": "no goals that motors report. Expected a JointState",
-}
-"""Text for a recording in which no topic fits a role."""
-COMMAND_WORDS = ("command", "cmd", "position_monitoring")
-"""A topic of joint values with one of these in its name holds commands."""
-WISH_WORDS = (*COMMAND_WORDS, "desired", "goal", "reference", "setpoint", "target")
-"""A topic with one of these in its name holds no readings."""
-GOAL_TOPIC = "/joint_goals"
-"""Topic of the goals that motors report, in our recordings."""
-LISTED_TOPICS = 20
-"""Topics that an error text lists at most."""
-
-
-@dataclass(frozen=True)
-class BagTopics:
-    """Which topics to read, where types and names of topics leave a choice.
-
-    Attributes:
-        command: Topic of the commands; None: the one that fits.
-        tool: Topic of the tool's position; None: the one that fits, if any.
-        position: Topic of the motor readings; None: the one that fits, if any.
-        goal: Topic of the goals that the motors report to have received; None: `GOAL_TOPIC`, if
-            there is one.
-    """
-
-    command: str | None = None
-    tool: str | None = None
-    position: str | None = None
-    goal: str | None = None
-
-
-def fitting_topics(
-    role: Role, name: str | None, found: Sequence[BagTopic], path: Path
-) -> list[BagTopic]:
-    """Return the topics that can play a role: the one named, or all that type and name allow.
-
-    Raises:
-        InputError: If the topic named does not exist, is empty or cannot play the role.
-    """
-    if name is None:
-        return [topic for topic in found if topic.count and _suits(role, topic)]
-    same = [topic for topic in found if topic.name.strip("/") == name.strip("/")]
-    if not same:
-        raise InputError(f"{path}: {unknown_name('topic', name, [t.name for t in found])}")
-    (topic,) = same
-    check_role(role, topic.kind, f"{path}: topic {topic}")
-    if topic.count == 0:
-        raise InputError(f"{path}: topic {topic} is empty. Name another one as the {role}.")
-    return same
-
-
-def _suits(role: Role, topic: BagTopic) -> bool:
-    kind, name = topic.kind, topic.name.lower()
-    if kind not in KINDS[role]:
-        return False
-    if role == "goal":
-        return topic.name == GOAL_TOPIC
-    if role == "command":
-        return kind is Kind.TRAJECTORY or any(word in name for word in COMMAND_WORDS)
-    return not any(word in name for word in WISH_WORDS)
-
-
-def only_topic(role: Role, topics: Sequence[BagTopic], path: Path) -> BagTopic | None:
-    """Return the one topic for a role, None if there is none.
-
-    Raises:
-        InputError: If there are several.
-    """
-    if len(topics) > 1:
-        example = f'{role} = "{topics[0].name}"'
-        raise InputError(
-            f"{path}: several topics could be the {role}: {_listed(topics)}. Name one, such as "
-            f"{example}, under [topics] in a TOML file for --columns or in BagTopics in Python."
-        )
-    return topics[0] if topics else None
-
-
-def check_understood(found: Sequence[BagTopic], path: Path) -> None:
-    """Raise an InputError if no topic holds messages that are understood."""
-    if not any(topic.count and topic.kind for topic in found):
-        kinds = ", ".join(kind.value for kind in Kind)
-        raise InputError(
-            f"{path}: holds no messages that are understood. Expected {kinds}. "
-            f"Found: {_listed(found)}."
-        )
-
-
-def nothing_for(role: Role, found: Sequence[BagTopic], path: Path) -> InputError:
-    """Return the error for a role that no topic fits."""
-    return InputError(
-        f"{path}: holds {EXPECTED[role]}; if another topic holds them, name it under [topics] in a "
-        f"TOML file for --columns or in BagTopics in Python. Found: {_listed(found)}."
-    )
-
-
-def _listed(topics: Sequence[BagTopic]) -> str:
-    shown = [str(topic) for topic in topics[:LISTED_TOPICS]]
-    if len(topics) > LISTED_TOPICS:
-        shown.append(f"and {len(topics) - LISTED_TOPICS} more")
-    return ", ".join(shown) or "no topics"

@@ -9,24 +9,26 @@ import re
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.runs import GOAL_VARIABLE
 from failuretwin.core.types import FloatArray, IntArray, as_floats
 from failuretwin.data_knowledge.readers.bag_file import read_messages, read_topics
 from failuretwin.data_knowledge.readers.bag_messages import (
+    GOAL_TOPIC,
+    KINDS,
     NS_PER_S,
     ROLES,
     BagMessage,
+    BagTopic,
     BagTopics,
+    Kind,
     Role,
     Rows,
-    check_understood,
-    fitting_topics,
-    nothing_for,
-    only_topic,
+    check_role,
     topic_rows,
 )
 from failuretwin.data_knowledge.readers.timed_log import Samples, Targets, TimedLog, held
@@ -52,17 +54,11 @@ def read_bag(path: Path, robot: Robot, topics: BagTopics | None = None) -> Timed
             topics, or lacks a joint.
     """
     recording = _Recording(path, robot, topics or BagTopics())
-    check_understood(recording.found, path)
-    tool = recording.rows("tool")
-    position = recording.rows("position", needed=tool is None)
-    command = recording.rows("command", needed=True)
-    if command is None:
-        raise nothing_for("command", recording.found, path)
+    command, tool = recording.needed_rows("command"), recording.rows("tool")
+    position = recording.needed_rows("position") if tool is None else recording.rows("position")
     goal = recording.rows("goal")
     _check_commanded(command, robot)
-    if tool is None:
-        if position is None:
-            raise nothing_for("tool", recording.found, path)
+    if tool is None and position is not None:
         _check_whole(position)
     zero_ns = _first_stamp([t for t in (command, tool, position) if t is not None], path)
     return TimedLog(
@@ -91,12 +87,29 @@ def read_targets(path: Path, robot: Robot) -> Targets | None:
     fitting = recording.fitting
     if fitting["tool"] or fitting["position"] or not fitting["command"]:
         return None
-    command = recording.rows("command", needed=True)
-    if command is None or command.duration is None:
+    command = recording.needed_rows("command")
+    if command.duration is None:
         return None
     _check_commanded(command, robot)
     targets = _command(command, None, int(command.stamp_ns[0]))
     return targets if isinstance(targets, Targets) else None
+
+
+# Which topic of a recording is what: commands, the tool's position, motor readings.
+
+EXPECTED: dict[Role, str] = {
+    "command": "no commands. Expected a JointTrajectory, or joint values on a topic that has "
+    "`command` or `position_monitoring` in its name",
+    "position": "neither tool positions nor motor readings. Expected a PointStamped, PoseStamped "
+    "or JointState, or a topic `condition_monitoring`",
+}
+"""Text for a recording in which no topic fits a role that is needed."""
+COMMAND_WORDS = ("command", "cmd", "position_monitoring")
+"""A topic of joint values with one of these in its name holds commands."""
+WISH_WORDS = (*COMMAND_WORDS, "desired", "goal", "reference", "setpoint", "target")
+"""A topic with one of these in its name holds no readings."""
+LISTED_TOPICS = 20
+"""Topics that an error text lists at most."""
 
 
 class _Recording:
@@ -104,9 +117,33 @@ class _Recording:
 
     def __init__(self, path: Path, robot: Robot, named: BagTopics) -> None:
         self.path, self.robot, self.found = path, robot, read_topics(path)
-        self.fitting = {
-            role: fitting_topics(role, getattr(named, role), self.found, path) for role in ROLES
-        }
+        self.fitting = {role: self._fitting(role, getattr(named, role)) for role in ROLES}
+        if not any(topic.count and topic.kind for topic in self.found):
+            kinds = ", ".join(kind.value for kind in Kind)
+            raise InputError(
+                f"{path}: holds no messages that are understood. Expected {kinds}. "
+                f"Found: {_listed(self.found)}."
+            )
+
+    def _fitting(self, role: Role, name: str | None) -> list[BagTopic]:
+        """Return the topics that can play a role: the one named, or all that type and name allow.
+
+        Raises:
+            InputError: If the topic named does not exist, is empty or cannot play the role.
+        """
+        if name is None:
+            return [topic for topic in self.found if topic.count and _suits(role, topic)]
+        same = [topic for topic in self.found if topic.name.strip("/") == name.strip("/")]
+        if not same:
+            names = [topic.name for topic in self.found]
+            raise InputError(f"{self.path}: {unknown_name('topic', name, names)}")
+        (topic,) = same
+        check_role(role, topic.kind, f"{self.path}: topic {topic}")
+        if topic.count == 0:
+            raise InputError(
+                f"{self.path}: topic {topic} is empty. Name another one as the {role}."
+            )
+        return same
 
     @cached_property
     def messages(self) -> dict[str, list[BagMessage]]:
@@ -114,21 +151,67 @@ class _Recording:
         names = {topic.name for topics in self.fitting.values() for topic in topics}
         return read_messages(self.path, sorted(names))
 
-    def rows(self, role: Role, *, needed: bool = False) -> Rows | None:
-        """Return the rows of the topic for a role; topics of other joints only do not count."""
-        fitting, where = self.fitting[role], f"{self.path}: topic"
-        read = {
-            topic.name: topic_rows(self.messages[topic.name], kind, role, f"{where} {topic.name}")
-            for topic in fitting
-            if (kind := topic.kind) is not None
-        }
-        if role == "tool":
-            topic = only_topic(role, fitting, self.path)
-            return None if topic is None else read[topic.name]
-        ours = [topic for topic in fitting if _names_a_motor(read[topic.name].names, self.robot)]
-        # If none is ours but one is needed, the first is refused for the joints that it names.
-        topic = only_topic(role, ours or (fitting[:1] if needed else []), self.path)
-        return None if topic is None else motor_rows(read[topic.name], self.robot)
+    def rows(self, role: Role) -> Rows | None:
+        """Return the rows of the topic for a role; topics of other joints only do not count.
+
+        Raises:
+            InputError: If there are several topics, or a motor is missing.
+        """
+        read = {topic: self._read(topic, role) for topic in self.fitting[role]}
+        ours = [t for t in read if role == "tool" or _names_a_motor(read[t].names, self.robot)]
+        if len(ours) > 1:
+            example = f'{role} = "{ours[0].name}"'
+            raise InputError(
+                f"{self.path}: several topics could be the {role}: {_listed(ours)}. Name one, such "
+                f"as {example}, under [topics] in a TOML file for --columns or in BagTopics in "
+                "Python."
+            )
+        if not ours:
+            return None
+        rows = read[ours[0]]
+        return rows if role == "tool" else motor_rows(rows, self.robot)
+
+    def needed_rows(self, role: Role) -> Rows:
+        """Return the rows of the topic for a role of the motors.
+
+        Raises:
+            InputError: If there is none, or as `rows`.
+        """
+        rows, fitting = self.rows(role), self.fitting[role]
+        if rows is not None:
+            return rows
+        if fitting:  # refused for the joints that it names
+            return motor_rows(self._read(fitting[0], role), self.robot)
+        raise InputError(
+            f"{self.path}: holds {EXPECTED[role]}; if another topic holds them, name it under "
+            "[topics] in a TOML file for --columns or in BagTopics in Python. Found: "
+            f"{_listed(self.found)}."
+        )
+
+    def _read(self, topic: BagTopic, role: Role) -> Rows:
+        kind = cast("Kind", topic.kind)  # one that fits the role
+        return topic_rows(self.messages[topic.name], kind, role, f"{self.path}: topic {topic.name}")
+
+
+def _suits(role: Role, topic: BagTopic) -> bool:
+    kind, name = topic.kind, topic.name.lower()
+    if kind not in KINDS[role]:
+        return False
+    if role == "goal":
+        return topic.name == GOAL_TOPIC
+    if role == "command":
+        return kind is Kind.TRAJECTORY or any(word in name for word in COMMAND_WORDS)
+    return not any(word in name for word in WISH_WORDS)
+
+
+def _listed(topics: Sequence[BagTopic]) -> str:
+    shown = [str(topic) for topic in topics[:LISTED_TOPICS]]
+    if len(topics) > LISTED_TOPICS:
+        shown.append(f"and {len(topics) - LISTED_TOPICS} more")
+    return ", ".join(shown) or "no topics"
+
+
+# Joints of a recording as motors of the robot.
 
 
 def motor_rows(rows: Rows, robot: Robot) -> Rows:

@@ -11,13 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import AXES
-from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.column_map import (
     SERVO,
     AngleColumns,
@@ -27,12 +25,9 @@ from failuretwin.data_knowledge.readers.column_map import (
     ToolColumns,
     map_text,
 )
-from failuretwin.data_knowledge.readers.table import load_csv, separator_of
+from failuretwin.data_knowledge.readers.table import Table, separator_of
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.urdf.file import read_urdf
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 COMMAND_WORDS = {"cmd", "command", "commanded", "target", "desired", "ref", "reference", "goal"}
 COMMAND_WORDS |= {"setpoint", "set", "sp", "des"}
@@ -75,7 +70,7 @@ def _guess(path: Path, robot: Robot) -> tuple[ColumnMap, list[str], list[str]]:
         questions, none where the names answer all of them.
     """
     separator = separator_of(path)
-    table = _Table(load_csv(path, separator))
+    table = _Guessed(Table.read(path, separator))
     found = _candidates(table.words, robot)
     first = {part: _firsts(candidates) for part, candidates in found.items()}
     command, position, tool = first[COMMAND], first[READING], first[PLACE]
@@ -106,31 +101,24 @@ def _guess(path: Path, robot: Robot) -> tuple[ColumnMap, list[str], list[str]]:
 
 
 @dataclass(frozen=True)
-class _Table:
-    """A CSV file with every cell as text."""
+class _Guessed:
+    """What names and numbers of a table's columns suggest."""
 
-    cells: pd.DataFrame
+    table: Table
 
     @cached_property
     def words(self) -> dict[str, set[str]]:
         """Words of each column's name."""
-        return {str(name): _words(str(name)) for name in self.cells}
-
-    def values(self, columns: Sequence[str]) -> FloatArray:
-        """Return columns as numbers, (row, column); NaN for text."""
-        import pandas as pd
-
-        part = self.cells[list(columns)].apply(pd.to_numeric, errors="coerce")
-        return part.to_numpy(dtype=np.float64)
+        return {name: _words(name) for name in self.table.names}
 
     def largest(self, columns: Sequence[str]) -> float:
         """Return the largest magnitude in some columns."""
-        return float(np.nanmax(np.abs(self.values(columns)), initial=0.0))
+        return float(np.nanmax(np.abs(self.table.values(columns)), initial=0.0))
 
     def increasing(self) -> str:
         """Return the first column whose numbers only grow, or an empty text."""
         for name in self.words:
-            values = self.values([name])[:, 0]
+            values = self.table.values([name])[:, 0]
             if len(values) > 1 and np.all(np.diff(values) > 0):
                 return name
         return ""
@@ -155,7 +143,7 @@ class _Table:
         """Return the unit of the times: stated, or by their size and step."""
         if not column:
             return "s"
-        named, values = self.named_unit([column], TIME_NAMES), self.values([column])[:, 0]
+        named, values = self.named_unit([column], TIME_NAMES), self.table.values([column])[:, 0]
         if named or not np.isfinite(values).any():
             return named or "iso"
         for limit, unit in ((1e17, "ns"), (1e14, "us"), (1e11, "ms")):
@@ -166,7 +154,7 @@ class _Table:
 
     def duration_unit(self, columns: Sequence[str]) -> str:
         """Return the unit of the times to reach targets."""
-        long = len(columns) > 0 and np.nanmedian(self.values(columns)) > 50.0
+        long = len(columns) > 0 and np.nanmedian(self.table.values(columns)) > 50.0
         return self.named_unit(columns, TIME_NAMES) or ("ms" if long else "s")
 
     def angle_unit(self, columns: Sequence[str], robot: Robot) -> str:
@@ -174,7 +162,7 @@ class _Table:
         named = self.named_unit(columns, ANGLE_NAMES)
         if named or not columns:
             return named or "rad"
-        size = float(np.nanmedian(np.abs(self.values(columns))))
+        size = float(np.nanmedian(np.abs(self.table.values(columns))))
         if robot.profile.servo_units is not None and size > 180.0:
             return SERVO
         return "deg" if self.largest(columns) > LARGEST_RAD else "rad"

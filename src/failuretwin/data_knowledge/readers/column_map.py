@@ -16,8 +16,10 @@ import numpy as np
 
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, check_name
+from failuretwin.core.runs import GOAL_VARIABLE
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.readers.timed_log import SHAPES
+from failuretwin.data_knowledge.readers.table import Table
+from failuretwin.data_knowledge.readers.timed_log import SHAPES, Samples, Targets, TimedLog, held
 from failuretwin.digital_model.robot import Robot
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -45,6 +47,30 @@ class TimeColumn:
 
     def __post_init__(self) -> None:
         check_name("unit", self.unit, [*TIME_UNITS, ISO])
+
+    def seconds(self, table: Table) -> FloatArray:
+        """Return the times of the rows from that of the first on, (row,) [s]."""
+        import pandas as pd
+
+        if self.unit != ISO:
+            values = table.numbers([self.column])[:, 0]
+            if not np.all(np.isfinite(values)):
+                raise InputError(f"{table.path}: column {self.column} has rows without a time.")
+            return as_floats((values - values[0]) * TIME_UNITS[self.unit])
+        table.check([self.column])
+        try:
+            stamps = pd.to_datetime(table.cells[self.column], format="ISO8601", utc=True)
+        except ValueError as error:
+            raise InputError(
+                f"{table.path}: column {self.column} is no ISO 8601 time: {error}."
+            ) from error
+        return as_floats((stamps - stamps.iloc[0]).dt.total_seconds())
+
+
+def _present(time: FloatArray, values: FloatArray) -> Samples:
+    """Return the rows that hold any value."""
+    filled = np.isfinite(values).any(axis=1)
+    return Samples(time[filled], values[filled])
 
 
 @dataclass(frozen=True)
@@ -93,6 +119,10 @@ class AngleColumns:
             angle, zero = values * scale, np.asarray(self.zero or 0.0) * scale
         return as_floats((angle - zero) * np.asarray(self.sign or 1.0))
 
+    def angles(self, table: Table, time: FloatArray, robot: Robot) -> Samples:
+        """Return the angles in the rows at times (row,) [s], in the robot's sense."""
+        return _present(time, self.to_robot(table.numbers(self.columns), robot))
+
 
 @dataclass(frozen=True)
 class CommandColumns(AngleColumns):
@@ -119,6 +149,23 @@ class CommandColumns(AngleColumns):
                 "targets need to know how long a movement takes. Name duration_columns, or give "
                 "duration_s for all."
             )
+
+    def commands(self, table: Table, time: FloatArray, robot: Robot) -> Samples | Targets:
+        """Return the commands in the rows at times (row,) [s]."""
+        samples = self.angles(table, time, robot)
+        if len(samples.time) == 0:
+            raise InputError(f"{table.path}: no row holds a command. Check the [command] columns.")
+        if self.kind == "sampled":
+            return samples
+        # A log may repeat the target in every row; a movement begins where it changes.
+        target = held(samples.value)
+        new = np.concatenate([[True], np.any(np.diff(target, axis=0) != 0.0, axis=1)])
+        duration = np.array(self.duration_s, dtype=np.float64)
+        if self.duration_columns:
+            rows = np.isin(time, samples.time[new])
+            scale = TIME_UNITS[self.duration_unit]
+            duration = table.numbers(self.duration_columns)[rows] * scale
+        return Targets(samples.time[new], target[new], np.broadcast_to(duration, target[new].shape))
 
 
 @dataclass(frozen=True)
@@ -183,6 +230,33 @@ class ColumnMap:
     decimal: str = "."
     sensors: tuple[SensorColumns, ...] = ()
     goal: AngleColumns | None = None
+
+    def logs(self, path: Path, robot: Robot) -> list[TimedLog]:
+        """Return the runs in a CSV file.
+
+        Raises:
+            InputError: If the file cannot be read or lacks a column, or a value is no number.
+        """
+        table = Table.read(path, self.separator, self.decimal)
+        if self.run is None:
+            return [self._log(table, robot, path.stem)]
+        return [self._log(part, robot, f"{path.stem}/{key}") for key, part in table.parts(self.run)]
+
+    def _log(self, table: Table, robot: Robot, name: str) -> TimedLog:
+        """Return the rows of one run as a log."""
+        time, tool = self.time.seconds(table), self.tool
+        sensors = {one.variable: _present(time, table.numbers(one.columns)) for one in self.sensors}
+        if self.goal is not None:
+            sensors[GOAL_VARIABLE] = self.goal.angles(table, time, robot)
+        return TimedLog(
+            name=name,
+            command=self.command.commands(table, time, robot),
+            tool=None
+            if tool is None
+            else _present(time, table.numbers(tool.columns) * LENGTH_UNITS[tool.unit]),
+            position=None if self.position is None else self.position.angles(table, time, robot),
+            sensors=sensors,
+        )
 
 
 def read_column_map(path: Path, robot: Robot) -> ColumnMap:

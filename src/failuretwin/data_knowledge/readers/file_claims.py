@@ -7,21 +7,23 @@ the memory is refused by `check_size`, whatever else it holds.
 
 from __future__ import annotations
 
+import bz2
 import json
 import math
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from io import BytesIO
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import IO, TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from failuretwin.core.errors import InputError
-from failuretwin.core.foreign import LEAST_BYTES, check_size, read_text, reading
+from failuretwin.core.errors import InputError, needs_extra
+from failuretwin.core.foreign import LEAST_BYTES, MB, check_size, read_text, reading
 
 if TYPE_CHECKING:
-    import h5py
     import zarr
 
 TEXT_CELL_BYTES = 64
@@ -38,7 +40,8 @@ def check_netcdf(path: Path) -> None:
 
     def weigh(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset):
-            _check_inside(path, name, item)
+            if item.external or item.is_virtual:
+                raise _elsewhere(path, name)
             cell = TEXT_CELL_BYTES if h5py.check_string_dtype(item.dtype) else item.dtype.itemsize
             largest = max(math.prod(item.shape or ()), math.prod(item.chunks or ()))
             found.append(float(largest) * cell)
@@ -46,16 +49,13 @@ def check_netcdf(path: Path) -> None:
     with h5py.File(path, "r") as file:
         for name in file:
             if isinstance(file.get(name, getlink=True), h5py.ExternalLink):
-                raise InputError(
-                    f"{path}: {name!r} lies in another file. Write all of it into one."
-                )
+                raise _elsewhere(path, name)
         file.visititems(weigh)
     check_size(sum(found), path, "its arrays")
 
 
-def _check_inside(path: Path, name: str, dataset: h5py.Dataset) -> None:
-    if dataset.external or dataset.is_virtual:
-        raise InputError(f"{path}: {name!r} lies in another file. Write all of it into one.")
+def _elsewhere(path: Path, name: str) -> InputError:
+    return InputError(f"{path}: {name!r} lies in another file. Write all of it into one.")
 
 
 # Zarr: a folder of chunks, with a JSON file for each array.
@@ -137,6 +137,7 @@ DEEPEST = 32
 """Cells within cells; published files have three."""
 ELEMENT_BYTES = 16
 """Largest memory of an element of a matrix: two doubles, or an object [bytes]."""
+Order = Literal["little", "big"]
 
 
 def check_matlab(path: Path) -> None:
@@ -145,67 +146,61 @@ def check_matlab(path: Path) -> None:
         data = path.read_bytes()
         if len(data) < HEADER_BYTES or data[126:128] not in (b"IM", b"MI"):
             raise InputError(f"{path}: is no MATLAB file. Save it with the option -v7.")
-        walk = _MatlabWalk(path, "little" if data[126:128] == b"IM" else "big")
-        walk.elements(memoryview(data)[HEADER_BYTES:], 0)
+        order: Order = "little" if data[126:128] == b"IM" else "big"
+        _weigh_elements(memoryview(data)[HEADER_BYTES:], order, path, 0.0, 0)
 
 
-class _MatlabWalk:
-    """Adds up what the matrices of a file claim, each of which has to lie within what holds it."""
+def _weigh_elements(data: memoryview, order: Order, path: Path, total: float, depth: int) -> float:
+    """Return `total` and what the matrices in a buffer claim [bytes]; each has to lie in it."""
+    if depth > DEEPEST:
+        raise InputError(f"{path}: holds cells within cells more than {DEEPEST} deep.")
+    for kind, body in _elements(data, order, path):
+        if kind == COMPRESSED:
+            total = _weigh_elements(_inflated(body, path, total), order, path, total, depth + 1)
+        elif kind == MATRIX:
+            total += _claim(body, order, path)
+            check_size(total, path, "its matrices")
+            total = _weigh_elements(body, order, path, total, depth + 1)
+    return total
 
-    def __init__(self, path: Path, order: Any) -> None:
-        self.path, self.order, self.total = path, order, 0.0
 
-    def elements(self, data: memoryview, depth: int) -> None:
-        """Go through the elements of a buffer."""
-        if depth > DEEPEST:
-            raise InputError(f"{self.path}: holds cells within cells more than {DEEPEST} deep.")
-        for kind, body in self._split(data):
-            if kind == COMPRESSED:
-                self.elements(self._inflated(body), depth + 1)
-            elif kind == MATRIX:
-                self._claim(body)
-                self.elements(body, depth + 1)
+def _elements(data: memoryview, order: Order, path: Path) -> Iterator[tuple[int, memoryview]]:
+    """Yield type and content of the elements in a buffer."""
+    at = 0
+    while at + 8 <= len(data):
+        kind = int.from_bytes(data[at : at + 4], order)
+        size, start = int.from_bytes(data[at + 4 : at + 8], order), at + 8
+        if kind >> 16:  # up to four bytes stand in the tag itself
+            kind, size, start = kind & 0xFFFF, kind >> 16, at + 4
+        if start + size > len(data) or (start == at + 4 and size > 4):
+            raise InputError(
+                f"{path}: an element claims {size} bytes where {len(data) - start} are left. The "
+                "file was cut off or changed: copy it again."
+            )
+        yield kind, data[start : start + size]
+        padding = 0 if kind == COMPRESSED else -size % 8
+        at = at + 8 if start == at + 4 else start + size + padding
 
-    def _split(self, data: memoryview) -> Iterator[tuple[int, memoryview]]:
-        at = 0
-        while at + 8 <= len(data):
-            kind, size = self._number(data[at : at + 4]), self._number(data[at + 4 : at + 8])
-            start = at + 8
-            if kind >> 16:  # up to four bytes stand in the tag itself
-                kind, size, start = kind & 0xFFFF, kind >> 16, at + 4
-            if start + size > len(data) or (start == at + 4 and size > 4):
-                raise InputError(
-                    f"{self.path}: an element claims {size} bytes where {len(data) - start} are "
-                    "left. The file was cut off or changed: copy it again."
-                )
-            yield kind, data[start : start + size]
-            padding = 0 if kind == COMPRESSED else -size % 8
-            at = at + 8 if start == at + 4 else start + size + padding
 
-    def _number(self, data: memoryview) -> int:
-        return int.from_bytes(data, self.order)
+def _inflated(data: memoryview, path: Path, total: float) -> memoryview:
+    limit = max(LEAST_BYTES, len(data))
+    inflate, parts, rest = zlib.decompressobj(), list[bytes](), bytes(data)
+    while rest and not inflate.eof:
+        parts.append(inflate.decompress(rest, limit))
+        rest = inflate.unconsumed_tail
+        total += len(parts[-1])
+        check_size(total, path, "what is compressed in it")
+    return memoryview(b"".join(parts))
 
-    def _inflated(self, data: memoryview) -> memoryview:
-        limit = max(LEAST_BYTES, len(data))
-        inflate, parts, size = zlib.decompressobj(), [], 0
-        rest = bytes(data)
-        while rest and not inflate.eof:
-            part = inflate.decompress(rest, limit)
-            rest = inflate.unconsumed_tail
-            size += len(part)
-            check_size(self.total + size, self.path, "what is compressed in it")
-            parts.append(part)
-        return memoryview(b"".join(parts))
 
-    def _claim(self, matrix: memoryview) -> None:
-        """Add what a matrix takes by its dimensions, the second of its elements."""
-        elements = self._split(matrix)
-        next(elements, None)
-        kind, body = next(elements, (0, memoryview(b"")))
+def _claim(matrix: memoryview, order: Order, path: Path) -> float:
+    """Return what a matrix takes by its dimensions, the second of its elements [bytes]."""
+    for kind, body in islice(_elements(matrix, order, path), 1, 2):
         if kind == INT32:
-            sizes = [self._number(body[i : i + 4]) for i in range(0, len(body) - 3, 4)]
-            self.total += float(math.prod(sizes)) * ELEMENT_BYTES
-            check_size(self.total, self.path, "its matrices")
+            whole = range(0, len(body) - 3, 4)
+            sizes = [int.from_bytes(body[i : i + 4], order) for i in whole]
+            return float(math.prod(sizes)) * ELEMENT_BYTES
+    return 0.0
 
 
 # npz: a ZIP archive of arrays, each with a header that says shape and type.
@@ -224,3 +219,60 @@ def check_npz(path: Path) -> None:
                 shape, _, dtype = read(file)
                 total += max(float(math.prod(shape)) * dtype.itemsize, float(entry.file_size))
             check_size(total, path, "its arrays")
+
+
+# Recordings of ROS: a kilobyte of a compressed chunk can unfold to gigabytes, whatever the record
+# beside it says, so each chunk is unfolded in steps that are thrown away.
+
+STEP_BYTES = 16 * MB
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+Unfold = Callable[[IO[bytes]], IO[bytes]]
+"""Opens a compressed file."""
+
+
+def check_recording(path: Path) -> None:
+    """Raise InputError if the chunks of a ROS 1 bag or an MCAP file unfold to too much."""
+    with path.open("rb") as file:
+        is_mcap = file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+        file.seek(0)
+        if not is_mcap and path.suffix != ".bag":
+            return
+        total = 0
+        for unfold, data in (_mcap_chunks if is_mcap else _ros1_chunks)(file, path):
+            with unfold(BytesIO(data)) as chunk:
+                while part := chunk.read(STEP_BYTES):
+                    total += len(part)
+                    check_size(total, path, "its messages")
+
+
+def _ros1_chunks(file: IO[bytes], path: Path) -> Iterator[tuple[Unfold, bytes]]:
+    import lz4.frame
+    from rosbags.rosbag1 import Reader
+
+    unfold: dict[Any, Unfold] = {bz2.decompress: bz2.open, lz4.frame.decompress: lz4.frame.open}
+    with Reader(path) as bag:
+        for chunk in bag.chunks.values():
+            file.seek(chunk.datapos)
+            yield unfold.get(chunk.decompressor, _as_it_is), file.read(chunk.datasize)
+
+
+def _mcap_chunks(file: IO[bytes], path: Path) -> Iterator[tuple[Unfold, bytes]]:
+    with needs_extra(f"{path}: MCAP files need mcap", "files"):
+        from mcap.records import Chunk
+        from mcap.stream_reader import StreamReader
+    import lz4.frame
+
+    try:
+        from compression import zstd
+    except ImportError:
+        from backports import zstd
+    unfold: dict[str, Unfold] = {"lz4": lz4.frame.open, "zstd": zstd.open}
+    for record in StreamReader(file, emit_chunks=True).records:
+        if isinstance(record, Chunk):
+            yield unfold.get(record.compression, _as_it_is), record.data
+    if file.read(1):
+        raise InputError(f"{path}: goes on after its end. Record or copy it again.")
+
+
+def _as_it_is(file: IO[bytes]) -> IO[bytes]:
+    return file

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -249,31 +250,35 @@ def _calibration_in(path: Path) -> Path | None:
     Raises:
         InputError: If there are several.
     """
-    folders = (path, path / "meta", path / "calibration")
-    files = [f for folder in folders for f in sorted(folder.glob("*.json")) if _is_calibration(f)]
+    files = []
+    for file in (f for name in ("", "meta", "calibration") for f in (path / name).glob("*.json")):
+        with suppress(InputError):  # of other JSON files
+            _calibration(file)
+            files.append(file)
     if len(files) > 1:
         raise InputError(
-            f"{path}: holds {len(files)} calibration files: {', '.join(f.name for f in files)}. "
-            "Expected one. Name that of the follower arm: --columns FILE.json."
+            f"{path}: holds {len(files)} calibration files: "
+            f"{', '.join(sorted(f.name for f in files))}. Expected one. Name that of the follower "
+            "arm: --columns FILE.json."
         )
     return files[0] if files else None
 
 
-def _is_calibration(file: Path) -> bool:
-    try:
-        joints = _json(file)
-    except InputError:
-        return False
-    return (
-        isinstance(joints, dict)
-        and bool(joints)
-        and all(isinstance(one, dict) and "range_min" in one for one in joints.values())
-    )
+def _calibration(file: Path) -> dict[str, Any]:
+    """Return what a calibration file says of each joint.
 
-
-def _json(file: Path) -> Any:
+    Raises:
+        InputError: If the file is no calibration file of LeRobot.
+    """
     with reading(file, "JSON"):
-        return json.loads(read_text(file, "JSON"))
+        joints = json.loads(read_text(file, "JSON"))
+    entries = list(joints.values()) if isinstance(joints, dict) else []
+    if not entries or not all(isinstance(one, dict) and "range_min" in one for one in entries):
+        raise InputError(
+            f"{file}: no calibration of LeRobot. Expected for each joint range_min and range_max, "
+            "as `lerobot-calibrate` writes them."
+        )
+    return joints
 
 
 def _ranges(file: Path, robot: Robot) -> FloatArray:
@@ -282,13 +287,7 @@ def _ranges(file: Path, robot: Robot) -> FloatArray:
     Raises:
         InputError: If the file is no calibration file of LeRobot, or lacks a joint.
     """
-    joints = _json(file)
-    if not _is_calibration(file):
-        raise InputError(
-            f"{file}: no calibration of LeRobot. Expected for each joint range_min and range_max, "
-            "as `lerobot-calibrate` writes them."
-        )
-    wanted = [motor.joint for motor in robot.motors]
+    joints, wanted = _calibration(file), [motor.joint for motor in robot.motors]
     for joint in wanted:
         check_name("joint", joint, joints, f"{file} lacks a joint of {robot.name!r}: ")
     ends = [[joints[joint].get(end) for joint in wanted] for end in ("range_min", "range_max")]

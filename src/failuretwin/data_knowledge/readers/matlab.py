@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,10 +25,7 @@ from failuretwin.core.runs import AXES, RunTable, Truth, truth_of
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.readers.file_claims import check_matlab
 from failuretwin.data_knowledge.readers.raw_sessions import READING_RATE_HZ, published_onset
-from failuretwin.data_knowledge.recovery.recovery import (
-    path_error,
-    recover_movements,
-)
+from failuretwin.data_knowledge.recovery import recover_movements
 from failuretwin.data_knowledge.store import SUFFIXES, filling, replacing, save_run_set
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -100,9 +97,16 @@ def read_matlab_file(path: Path, robot: Robot, *, approximate: bool = False) -> 
     content = _load(path)
     for runs, labels in CELL_ARRAYS:
         if runs in content:
-            return _cell_array_runs(path, content, runs, labels, robot, approximate=approximate)
+            texts = [str(np.ravel(cell)[0]) for cell in np.ravel(content.get(labels, []))]
+            paths = _cell_paths(path, list(np.ravel(content[runs])), runs, texts, robot)
+            return _recovered(paths, robot, approximate)
     if "dataset" in content:
-        return _pair_run(path, content["dataset"], robot, approximate=approximate)
+        hidden = path.with_name(f"hidden_{path.name}")
+        name = f"{path.parent.name}/{path.stem}"
+        run = _Paths(name, *_split_paths(content["dataset"], str(path)), path.parent.name)
+        if hidden.exists():
+            return _pair_run(run, hidden, path, robot)
+        return _recovered([run], robot, approximate)
     present = ", ".join(name for name in content if not name.startswith("__")) or "nothing"
     hint = " Give the folder, or the dataset_i.mat beside it." if "hidden" in path.name else ""
     raise InputError(
@@ -125,38 +129,32 @@ def _load(path: Path) -> dict[str, Any]:
         return dict(load_from_mat(str(path)))
 
 
-def _cell_array_runs(
-    path: Path,
-    content: Mapping[str, Any],
-    runs: str,
-    labels: str,
-    robot: Robot,
-    *,
-    approximate: bool,
-) -> RunTable:
-    cells = np.ravel(content[runs])
+def _cell_paths(
+    path: Path, cells: Sequence[Any], runs: str, labels: Sequence[str], robot: Robot
+) -> list[_Paths]:
+    """Return the runs in a cell array `runs`, with the labels beside it, if any."""
     if len(cells) == 0:
         raise InputError(f"{path}: `{runs}` holds no runs. Expected cells of (samples, 6).")
-    texts = [str(np.ravel(cell)[0]) for cell in np.ravel(content.get(labels, []))]
-    if texts and len(texts) != len(cells):
-        raise InputError(f"{path}: {len(cells)} runs in `{runs}` but {len(texts)} labels.")
-    _check_labels(texts, robot, path)
+    if labels and len(labels) != len(cells):
+        raise InputError(f"{path}: {len(cells)} runs in `{runs}` but {len(labels)} labels.")
+    _check_labels(labels, robot, path)
     paths = []
     for i, cell in enumerate(cells):
         name = f"{path.stem}/run_{i + 1:03d}"
-        desired, measured = _split_paths(cell, f"{path}: {name}")
-        paths.append(_Paths(name, desired, measured, texts[i] if texts else None))
+        label = labels[i] if labels else None
+        paths.append(_Paths(name, *_split_paths(cell, f"{path}: {name}"), label))
     lengths = {len(run.desired) for run in paths}
     if len(lengths) > 1:
         raise InputError(f"{path}: runs have {sorted(lengths)} samples; expected equally many.")
-    return _recovered(paths, robot, approximate=approximate)
+    return paths
 
 
-def _recovered(paths: Sequence[_Paths], robot: Robot, *, approximate: bool) -> RunTable:
+def _recovered(paths: Sequence[_Paths], robot: Robot, approximate: bool) -> RunTable:
     """Return runs with commands recovered from their desired paths, and the error of recovery."""
     desired, names = np.stack([run.desired for run in paths]), [run.name for run in paths]
     time, movements = recover_movements(desired, robot, names=names, approximate=approximate)
-    off = path_error(movements, desired, time, robot)
+    path = DigitalTwin(robot).path(movements.reference(time))
+    off = np.linalg.norm(path - desired, axis=-1).max(axis=1)
     worst = int(np.argmax(off))
     shifted = replace(movements, start=movements.start - time[0])
     table = _table(paths, time - time[0], shifted, READING_RATE_HZ, robot)
@@ -164,21 +162,16 @@ def _recovered(paths: Sequence[_Paths], robot: Robot, *, approximate: bool) -> R
     return replace(table, attributes=attributes)
 
 
-def _pair_run(path: Path, dataset: Any, robot: Robot, *, approximate: bool) -> RunTable:
-    name = f"{path.parent.name}/{path.stem}"
-    desired, measured = _split_paths(dataset, str(path))
-    run = _Paths(name, desired, measured, path.parent.name)
-    hidden = path.with_name(f"hidden_{path.name}")
-    if not hidden.exists():
-        return _recovered([run], robot, approximate=approximate)
+def _pair_run(run: _Paths, hidden: Path, path: Path, robot: Robot) -> RunTable:
+    """Return the run of a pair, with the commands and responses in its hidden half."""
     time, command, response_time, response = _hidden(hidden, len(robot.motors))
-    if len(command) != len(desired) or not _same_path(command, desired, robot):
+    if len(command) != len(run.desired) or not _same_path(command, run.desired, robot):
         raise InputError(f"{path}: its desired path is not that of the commands in {hidden.name}.")
     late = round((response_time[0] - time[0]) / (time[1] - time[0]))
     drawn_out = np.mean(np.abs(np.diff(response, 2, axis=0)).max(axis=1) > 1e-9) < 0.5
     rate = READING_RATE_HZ if drawn_out else (len(time) - 1) / (time[-1] - time[0])
     table = _table(
-        [replace(run, measured=_later(measured, late))],
+        [replace(run, measured=_later(run.measured, late))],
         time - time[0],
         find_movements(command[None], time - time[0]),
         float(rate),
@@ -407,16 +400,14 @@ def write_csv(runs: xr.Dataset, path: Path) -> None:
     import pandas as pd
 
     time = as_floats(runs["time"].values)
-    ends = runs["duration"].values if "duration" in runs else [time[-1]] * runs.sizes["run"]
-    parts = []
-    for run, end in enumerate(ends):
-        kept = time <= end + 1e-9
-        name = as_cell(str(runs["run"].values[run]))
-        columns: dict[str, Any] = {"run": name, "time_s": time[kept]}
-        for m, motor in enumerate(runs["motor"].values):
-            columns[f"command_{motor}_rad"] = runs["command"].values[run, kept, m]
-        for a, axis in enumerate(AXES):
-            columns[f"tool_{axis}_m"] = runs["measured"].values[run, kept, a]
-        parts.append(pd.DataFrame(columns))
+    ends = runs["duration"].values if "duration" in runs else time[-1:]
+    kept = np.broadcast_to(time <= ends[:, None] + 1e-9, runs["command"].shape[:2])
+    run, sample = np.nonzero(kept)
+    names = np.array([as_cell(str(name)) for name in runs["run"].values], dtype=object)
+    columns: dict[str, Any] = {"run": names[run], "time_s": time[sample]}
+    for m, motor in enumerate(runs["motor"].values):
+        columns[f"command_{motor}_rad"] = runs["command"].values[kept, m]
+    for a, axis in enumerate(AXES):
+        columns[f"tool_{axis}_m"] = runs["measured"].values[kept, a]
     with replacing(path) as partial:
-        pd.concat(parts).to_csv(partial, index=False)
+        pd.DataFrame(columns).to_csv(partial, index=False)

@@ -17,7 +17,7 @@ from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import STEP_S, RunTable, Truth, concatenate
 from failuretwin.core.types import MS_PER_S, FloatArray, as_floats
-from failuretwin.data_knowledge.readers.table import load_csv, numbers
+from failuretwin.data_knowledge.readers.table import Table
 from failuretwin.data_knowledge.readers.timed_log import (
     Samples,
     check_clock,
@@ -140,12 +140,12 @@ def _check_range(
 
 def _read_table(path: Path, columns: Sequence[str]) -> FloatArray:
     """Return stamps and the given columns of a CSV file, (row, 1 + column), checked."""
-    table = load_csv(path)
+    table = Table.read(path)
     wanted = ["timestamp", *columns]
     for column in wanted:
-        if f"{column}.1" in table:  # pandas' name for a second column of that name
+        if f"{column}.1" in table.names:  # pandas' name for a second column of that name
             raise InputError(f"{path}: has two columns {column!r}. Remove one of them.")
-    values = numbers(table, wanted, path, gaps=False)
+    values = table.numbers(wanted, gaps=False)
     steps = np.diff(values[:, 0])
     if np.any(steps <= 0):
         row = int(np.argmax(steps <= 0))

@@ -38,7 +38,6 @@ from failuretwin.data_knowledge.readers.raw_sessions import (
     session_runs,
 )
 from failuretwin.data_knowledge.readers.rtde import is_rtde, read_rtde
-from failuretwin.data_knowledge.readers.table import read_mapped_csv
 from failuretwin.data_knowledge.readers.timed_log import TimedLog, timed_run
 from failuretwin.data_knowledge.store import SUFFIXES, load_run_set
 from failuretwin.digital_model.robot import Robot, load_robot
@@ -196,11 +195,10 @@ def _read_matlab(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Data
 def _read_csv(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
     """Return the runs of a text file: by the column map, else by its header."""
     if options.columns is not None:
-        logs = read_mapped_csv(path, options.columns, robot)
-        return _log_datasets(logs, robot, "CSV with a column map")
+        return _log_datasets(options.columns.logs(path, robot), robot, "CSV with a column map")
     if is_rtde(path):
         return _log_datasets([read_rtde(path, robot)], robot, RTDE_SOURCE)
-    logs = read_mapped_csv(path, unambiguous_columns(path, robot), robot)
+    logs = unambiguous_columns(path, robot).logs(path, robot)
     return _log_datasets(logs, robot, "CSV, columns by their names")
 
 

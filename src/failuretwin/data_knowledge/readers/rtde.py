@@ -22,13 +22,7 @@ from failuretwin.data_knowledge.readers.column_map import (
     TimeColumn,
     ToolColumns,
 )
-from failuretwin.data_knowledge.readers.table import (
-    first_line,
-    load_csv,
-    numbers,
-    read_mapped_csv,
-    separator_of,
-)
+from failuretwin.data_knowledge.readers.table import Table, first_line, separator_of
 from failuretwin.data_knowledge.readers.timed_log import TimedLog
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -94,7 +88,7 @@ def read_rtde(path: Path, robot: Robot) -> TimedLog:
         separator=separator,
         sensors=(SensorColumns("accelerometer", force),) if has_force else (),
     )
-    log = read_mapped_csv(path, mapping, robot)[0]
+    (log,) = mapping.logs(path, robot)
     _check_tcp(log, robot, path)
     return log
 
@@ -105,7 +99,7 @@ def _held(path: Path, separator: str, names: list[str], index: list[int]) -> boo
     others = [name for name in others if name in names]
     if not others:
         return True
-    target = numbers(load_csv(path, separator), others, path)
+    target = Table.read(path, separator).numbers(others)
     return bool(np.ptp(target, axis=0).max(initial=0.0) < STILL_RAD)
 
 

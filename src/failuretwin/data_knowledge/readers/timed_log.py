@@ -7,14 +7,14 @@ units and in the sense of the robot's commands when they get here.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import ROUNDING_RAD, Movements
 from failuretwin.core.polyline import simplify_motors
-from failuretwin.core.runs import STEP_S, RunTable
+from failuretwin.core.runs import AXES, REQUIRED, STEP_S, VARIABLES, RunTable
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -68,10 +68,9 @@ def held(target: FloatArray) -> FloatArray:
 
 
 SHAPES: Mapping[str, tuple[int, ...]] = {
-    "tool_orientation": (3,),
-    "accelerometer": (3,),
-    "gyroscope": (3,),
-    "wire": (),
+    name: (len(AXES),) * (len(dims) - 2)
+    for name, (dims, _) in VARIABLES.items()
+    if dims[:2] == ("run", "time") and "motor" not in dims and name not in REQUIRED
 }
 """Channels of the sensors that a log may hold beside tool and motors; goals have one a motor."""
 
@@ -138,20 +137,19 @@ def _distinct(log: TimedLog) -> TimedLog:
         InputError: If a part of it runs backwards in time.
     """
 
-    def last(samples: Samples | None) -> Samples | None:
-        if samples is None or len(samples.time) == 0:
-            return samples
+    def last(samples: Samples) -> Samples:
         _check_times(samples.time, log.name)
-        kept = np.append(np.diff(samples.time) > 0, True)
+        kept = np.diff(samples.time, append=np.inf) > 0
         return Samples(samples.time[kept], samples.value[kept])
 
-    command = log.command
-    if isinstance(command, Samples):
-        command = last(command) or command
-    else:
-        _check_times(command.time, log.name)
-    sensors = {name: last(samples) or samples for name, samples in log.sensors.items()}
-    return TimedLog(log.name, command, last(log.tool), last(log.position), sensors)
+    _check_times(log.command.time, log.name)
+    return replace(
+        log,
+        command=last(log.command) if isinstance(log.command, Samples) else log.command,
+        tool=None if log.tool is None else last(log.tool),
+        position=None if log.position is None else last(log.position),
+        sensors={name: last(samples) for name, samples in log.sensors.items()},
+    )
 
 
 def _check_commands(log: TimedLog) -> None:

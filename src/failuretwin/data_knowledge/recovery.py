@@ -1,13 +1,15 @@
-"""Movements of one run from its tool path: ramps fitted one by one, then rounded or fitted at once.
+"""Motor commands recovered from desired tool paths, for published runs that hold no commands.
 
-Every ramp is fitted by least squares from many first guesses: targets by inverse kinematics,
-durations at random. A path without noise then gives the poses and speeds, and every ramp is rounded
-to whole servo counts and published durations.
+A desired path is what the kinematics make of the reference of the motors. Every ramp is fitted by
+least squares from many first guesses: targets by inverse kinematics, durations at random. A path
+without noise then gives the poses and speeds, and every ramp is rounded to whole servo counts and
+published durations, exactly. Other paths can be fitted by least squares.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -15,14 +17,10 @@ from itertools import product
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.movements import Movements
-from failuretwin.core.types import FloatArray, frozen_array
-from failuretwin.data_knowledge.recovery.ramp_fit import (
-    PathPart,
-    fit,
-    path_error,
-    single_movements,
-)
+from failuretwin.core.movements import Movements, stack_movements
+from failuretwin.core.runs import STEP_S
+from failuretwin.core.types import FloatArray, as_floats, frozen_array
+from failuretwin.data_knowledge.ramp_fit import PathPart, fit, path_error, single_movements
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -83,49 +81,115 @@ LEAST_REST_S, LEAST_MOVEMENT_S = 0.3, 0.1
 """Shorter rests belong to a movement, shorter movements to a rest [s]."""
 
 
-class NoWholeUnitsError(Exception):
+def recover_movements(
+    desired: FloatArray,
+    robot: Robot,
+    *,
+    names: Sequence[str],
+    time: FloatArray | None = None,
+    approximate: bool = False,
+) -> tuple[FloatArray, Movements]:
+    """Return the time grid (time,) [s] and the movements whose reference makes the desired paths.
+
+    Targets are whole servo units, ramps of the published durations; motors that stay have a
+    duration of 0, movements without any travel do not appear. The last ramp of a record that ends
+    within it is one of those that make what is seen of it, and a movement that begins after the
+    record does not appear. What comes back makes the desired path to 1e-9 m.
+
+    Args:
+        desired: Desired tool paths in the base frame, finite, (run, time, axis) [m].
+        robot: The robot.
+        names: Name of each run, for messages.
+        time: Uniform time grid, (time,) [s]; None: the published one that fits.
+        approximate: Fit the runs that have no such movements by least squares, with targets
+            and durations of any value. A tool position leaves the pose of an arm with more than
+            three motors open; the fit takes the pose nearest to the one before it among those
+            that also fit the ramps.
+
+    Raises:
+        InputError: If a run has no such movements and `approximate` is False, or nothing of its
+            path can be fitted.
+    """
+    grids = published_time_bases(desired.shape[1]) if time is None else [time]
+    grid = _fitting_grid(grids, desired, robot)
+    parts = [
+        _recover_run(PathPart(grid, path), robot, approximate, name)
+        for path, name in zip(desired, names, strict=True)
+    ]
+    return grid, stack_movements(parts)
+
+
+def published_time_bases(samples: int) -> list[FloatArray]:
+    """Return the grids that published runs come on, (time,) [s].
+
+    For 1000 samples these are 0.01 to 10.00, and 1000 points from 0 to 10.
+    """
+    end = samples * STEP_S
+    return [as_floats(np.arange(1, samples + 1) * STEP_S), np.linspace(0.0, end, samples)]
+
+
+def _fitting_grid(grids: Sequence[FloatArray], desired: FloatArray, robot: Robot) -> FloatArray:
+    """Return the grid on which movements of published durations make the desired paths.
+
+    The grids differ in their step, which whole movements reveal; an offset of the whole run in
+    time could not be seen. Runs whose movements are all cut off fit both. Where no run decides,
+    because none is exact, it is the first.
+    """
+    if len(grids) == 1:
+        return grids[0]
+    for path in desired:
+        fitting = []
+        for grid in grids:
+            with suppress(_NoWholeUnitsError):
+                _whole_run(PathPart(grid, path), robot)
+                fitting.append(grid)
+        if len(fitting) == 1:
+            return fitting[0]
+    return grids[0]
+
+
+def _recover_run(path: PathPart, robot: Robot, approximate: bool, name: str) -> Movements:
+    try:
+        return _whole_run(path, robot)
+    except _NoWholeUnitsError as reason:
+        if approximate:
+            return _nearest_run(path, robot, name)
+        raise InputError(
+            f"run {name!r}: no movements of robot {robot.name!r} between whole servo units make "
+            f"its desired path exactly: {reason}. If the path is of another robot, give that one "
+            "with --robot; if its targets are no whole units or it holds noise, use --approximate."
+        ) from None
+
+
+class _NoWholeUnitsError(Exception):
     """No movements between whole counts make the path; the text says where."""
 
 
-def whole_run(path: PathPart, robot: Robot) -> Movements:
-    """Return the movements between whole counts that make a path, with a leading run axis of 1.
+def _whole_run(path: PathPart, robot: Robot) -> Movements:
+    """Return the movements between whole counts that make a path.
 
-    A motor that stays has a duration of 0. Where the end of the record cuts off a ramp and several
-    targets and durations make the visible part, the result is one of these; where next to nothing
-    is visible, targets may lie between counts.
-
-    Raises:
-        NoWholeUnitsError: If no movements make this path.
+    Where next to nothing is seen of the last one, its targets may lie between counts.
     """
     if robot.profile.servo_units is None:
-        raise NoWholeUnitsError("the robot has no servo units")
+        raise _NoWholeUnitsError("the robot has no servo units")
     run = _Run(path, DigitalTwin(robot), noise=0.0)
     movements = run.whole()
     error = path_error(movements, path, run.twin)[0]
     if error.max() > EXACT_M:
         at = path.time[error.argmax()]
-        raise NoWholeUnitsError(f"at {at:.2f} s the tool does not rest where it should")
+        raise _NoWholeUnitsError(f"at {at:.2f} s the tool does not rest where it should")
     return movements
 
 
-def nearest_run(path: PathPart, robot: Robot, name: str) -> Movements:
-    """Return the movements that fit a path best, with a leading run axis of 1.
-
-    Args:
-        path: The desired path of the run.
-        robot: The robot.
-        name: Name of the run, for messages.
-
-    Raises:
-        InputError: If no movements make anything like the path.
-    """
-    best, least = None, np.inf
+def _nearest_run(path: PathPart, robot: Robot, name: str) -> Movements:
+    """Return the movements that fit a path best."""
+    least, best = np.inf, None
     for seed in SEEDS:
         run = _Run(path, DigitalTwin(robot), _noise(path), np.random.default_rng(seed))
         movements = run.nearest()
         rms = float(_rms(path_error(movements, path, run.twin))[0])
         if rms < least:
-            best, least = movements, rms
+            least, best = rms, movements
         if least <= run.good:
             break
     if best is None or least > POOR_FIT_M:
@@ -210,7 +274,7 @@ class _Run:
         if not self.spans:
             return self._joined(self._whole_poses(self.path.point[0])[:1], [])
         if self.spans == [(0, len(self.path.time) - 1)]:
-            raise NoWholeUnitsError("the record holds no settled pose")
+            raise _NoWholeUnitsError("the record holds no settled pose")
         return self._chain(self._whole_ramps)
 
     def _whole_poses(self, point: FloatArray) -> FloatArray:
@@ -219,7 +283,7 @@ class _Run:
         Every count of the last motor is tried; inverse kinematics gives the other motors.
 
         Raises:
-            NoWholeUnitsError: If there are none.
+            _NoWholeUnitsError: If there are none.
         """
         units, zero = self.twin.robot.servo_units, self._zero
         low, high = self._whole_limits
@@ -233,14 +297,14 @@ class _Run:
         poses = units.to_rad(whole[((whole >= low) & (whole <= high)).all(axis=1)])
         poses = poses[np.linalg.norm(self.twin.path(poses) - point, axis=1) <= 2.0 * EXACT_M]
         if not len(poses):
-            raise NoWholeUnitsError("no pose in whole servo units puts the tool where it rests")
+            raise _NoWholeUnitsError("no pose in whole servo units puts the tool where it rests")
         return poses[np.argsort(self._cost(poses, zero), kind="stable")]
 
     def _whole_ramps(self, m: int, origins: FloatArray | None) -> Movements:
         """Return the ramps between whole counts that make movement `m`.
 
         Raises:
-            NoWholeUnitsError: If there are none.
+            _NoWholeUnitsError: If there are none.
         """
         part = self._part(m)
         for fitted in self._fits(m, origins):
@@ -253,7 +317,7 @@ class _Run:
             if error[best] <= EXACT_M and self._is_cut_off(m):
                 return near  # too little of it is seen to tell its speeds
         at = self.path.time[self.spans[m][0]]
-        raise NoWholeUnitsError(
+        raise _NoWholeUnitsError(
             f"no start and durations of the published kind make the movement at {at:.2f} s"
         )
 

@@ -1,1 +1,0 @@
-"""Recovery of the commands of published runs from their tool paths."""
