@@ -23,6 +23,8 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import null_space
 
+from failuretwin.connection.registration.poses import Poses
+from failuretwin.connection.student_fit import StudentFit, fit_student
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.geometry import (
     NO_OFFSET,
@@ -327,6 +329,42 @@ class Fitted:
         return JointCorrection(
             joint.name, self.zero(j), _triple(T[:3, 3]), roll_pitch_yaw(T[:3, :3])
         )
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """An arm fitted to poses.
+
+    Attributes:
+        fitted: Its most probable numbers.
+        told: The fit, in units of what was believed before and metres.
+    """
+
+    fitted: Fitted
+    told: StudentFit
+
+
+def fit(
+    arm: Arm, start: Start, unknowns: Unknowns, poses: Poses, begin: FloatArray | None = None
+) -> Posterior:
+    """Return an arm fitted to poses.
+
+    Args:
+        arm: The arm.
+        start: Senses, zeros and frame to start from.
+        unknowns: What is asked.
+        poses: Settled poses.
+        begin: Numbers to begin at, (unknown,); None: 0.
+    """
+    spread, torque = unknowns.spread, arm.torque(poses.target, start)
+
+    def residual(x: FloatArray) -> FloatArray:
+        expected = Fitted(arm, start, unknowns, x * spread).expected(poses.target, torque)
+        return np.asarray(poses.point - expected)
+
+    begin = np.zeros(len(unknowns)) if begin is None else begin
+    told = fit_student(residual, begin / spread, 3)
+    return Posterior(Fitted(arm, start, unknowns, told.value * spread), told)
 
 
 def _triple(values: FloatArray) -> Triple:

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from failuretwin.connection.calibration.result import Parameter
-from failuretwin.connection.registration.arm import Arm, Fitted
+from failuretwin.connection.registration.arm import Arm, Fitted, Posterior, fit
 from failuretwin.connection.registration.poses import Poses, settled_poses
-from failuretwin.connection.registration.robust import Posterior, fit
 from failuretwin.connection.registration.search import Registered, search
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import check_motors
@@ -109,13 +108,13 @@ def register(poses: Poses, robot: Robot, source: str = "", date: str = "") -> Re
     told = f"failuretwin robot fit{when}: {len(poses)} settled poses"
     told += f" of {source}" if source else ""
     return Registration(
-        profile=_profile(robot, fitted, whole.noise, told),
+        profile=_profile(robot, fitted, whole.told.noise, told),
         parameters=_parameters(whole),
         poses=len(poses),
         before_mm=_middle_mm(poses.point - DigitalTwin(robot).path(poses.target)),
         frames_mm=_middle_mm(_error(found.best, poses)),
         after_mm=_unseen_mm(arm, whole, poses),
-        noise_m=whole.noise,
+        noise_m=whole.told.noise,
         not_told=tuple(_not_told(whole)),
         remarks=tuple(_remarks(robot, found, whole, poses)),
     )
@@ -216,7 +215,7 @@ STEP = 1e-5
 def _parameters(found: Posterior) -> tuple[Parameter, ...]:
     """Return the stated numbers with their intervals (delta method)."""
     slopes, names = _slopes(found.fitted), found.fitted.arm.robot.motor_names
-    deviations = np.sqrt(np.einsum("nu,uv,nv->n", slopes, found.covariance, slopes))
+    deviations = np.sqrt(np.einsum("nu,uv,nv->n", slopes, found.told.covariance, slopes))
     priors = np.linalg.norm(slopes, axis=1)
     rows = []
     for number, deviation, prior in zip(_stated(found.fitted), deviations, priors, strict=True):
@@ -286,7 +285,7 @@ def _slopes(fitted: Fitted) -> FloatArray:
 
 def _not_told(found: Posterior) -> list[str]:
     """Return the directions whose posterior is as wide as the prior, widest first."""
-    size, ways = np.linalg.eigh(found.covariance)
+    size, ways = np.linalg.eigh(found.told.covariance)
     sentences = []
     for deviation, way in sorted(zip(np.sqrt(size), ways.T, strict=True), key=lambda p: -p[0]):
         if deviation < NOT_TOLD:
