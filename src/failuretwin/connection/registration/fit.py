@@ -214,41 +214,26 @@ STEP = 1e-5
 
 def _parameters(found: Posterior) -> tuple[Parameter, ...]:
     """Return the stated numbers with their intervals (delta method)."""
-    slopes, names = _slopes(found.fitted), found.fitted.arm.robot.motor_names
+    slopes = _slopes(found.fitted)
     deviations = np.sqrt(np.einsum("nu,uv,nv->n", slopes, found.told.covariance, slopes))
     priors = np.linalg.norm(slopes, axis=1)
     rows = []
-    for number, deviation, prior in zip(_stated(found.fitted), deviations, priors, strict=True):
+    for one, deviation, prior in zip(_stated(found.fitted), deviations, priors, strict=True):
         if prior < 1e-9:  # fixed: no unknown moves it
             continue
         learned = bool(deviation < LEARNED * prior)
-        rows.append(
-            Parameter.normal(
-                number.name,
-                "" if number.motor is None else names[number.motor],
-                number.unit,
-                number.value,
-                float(deviation),
-                learned,
-                "" if learned else "the poses do not say; it stays where the URDF puts it",
-            )
-        )
+        note = "" if learned else "the poses do not say; it stays where the URDF puts it"
+        known = one.name, one.motor, one.unit, one.value
+        rows.append(Parameter.normal(*known, float(deviation), learned, note))
     return tuple(rows)
 
 
-@dataclass(frozen=True)
-class _Number:
-    """A number as people read it: a place rather than a change, an axis by shift and tilt."""
+def _stated(fitted: Fitted) -> list[Parameter]:
+    """Return the numbers of an arm as people read them, without their intervals.
 
-    name: str
-    motor: int | None
-    unit: str
-    value: float
-
-
-def _stated(fitted: Fitted) -> list[_Number]:
-    """Return the numbers of an arm, then shift and tilt of each axis in its own frame."""
-    places = iter((*fitted.base_xyz_rpy, *fitted.tool_xyz))
+    Places rather than changes; then shift and tilt of each axis in its own frame.
+    """
+    places, names = iter((*fitted.base_xyz_rpy, *fitted.tool_xyz)), fitted.arm.robot.motor_names
     numbers = []
     for unknown, value in zip(fitted.unknowns, fitted.values.tolist(), strict=True):
         if unknown.name.startswith("axis "):
@@ -258,10 +243,11 @@ def _stated(fitted: Fitted) -> list[_Number]:
             stated = fitted.zero(unknown.motor)
         elif unknown.name == "sensor scale":
             stated = fitted.scale
-        numbers.append(_Number(unknown.name, unknown.motor, unknown.unit, stated))
-    for j in range(fitted.arm.motors):
+        motor = "" if unknown.motor is None else names[unknown.motor]
+        numbers.append(Parameter.normal(unknown.name, motor, unknown.unit, stated, 0.0))
+    for j, motor in enumerate(names):
         axis = zip(AXIS_NUMBERS, fitted.moved(j).tolist(), strict=True)
-        numbers += [_Number(name, j, unit, value) for (name, unit), value in axis]
+        numbers += [Parameter.normal(name, motor, unit, value, 0.0) for (name, unit), value in axis]
     return numbers
 
 
