@@ -13,8 +13,7 @@ import argparse
 import numpy as np
 from acting import TOLERANCE_M, Row, possible, tasks_of
 
-from failuretwin.connection.commanded_arm import CommandedArm
-from failuretwin.connection.emulated_arm import Emulation
+from failuretwin.connection.emulated_arm import EmulatedArm, Emulation
 from failuretwin.connection.links.base import Event
 from failuretwin.core.hypothesis import Fault
 from failuretwin.core.types import FloatArray
@@ -29,7 +28,7 @@ from failuretwin.failure_behavior.injection import ScheduledFault
 STUCK_AT_S = 5.0
 
 
-class Watched(CommandedArm):
+class Watched(EmulatedArm):
     """A commanded arm that notes where it really stands when work on a target is over."""
 
     actor: Actor | None = None

@@ -33,7 +33,7 @@ from acting_world import TrueFault, World, home_of
 
 from failuretwin.app.arms import emulation_with
 from failuretwin.app.shadow import Shadow
-from failuretwin.connection.commanded_arm import OperatedArm, Shifts
+from failuretwin.connection.emulated_arm import EmulatedArm, Shifts
 from failuretwin.connection.links.base import Order
 from failuretwin.core.hypothesis import CLEAR, RAISED, SUSPECTED, Hypothesis, paper_hypotheses
 from failuretwin.core.types import FloatArray
@@ -338,7 +338,7 @@ class Watched:
 def watched(known: CalibratedRobot, fault: str, probes: int, seed: int) -> Watched:
     """Watch an emulated arm at work for two shifts, asking it in the second break."""
     emulation = emulation_with([fault] if fault else [], known, seed)
-    arm = OperatedArm(emulation, Shifts(break_s=BREAK_S))
+    arm = EmulatedArm(emulation, shifts=Shifts(break_s=BREAK_S))
     watch = monitor(known.twin, known.imperfections)
     prober = Prober(watch, SafetyGate(known.robot), arm, ProbeRules(probes), seed)
     shadow = Shadow(arm, watch, known.twin, [prober])

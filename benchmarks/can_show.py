@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin import DigitalTwin
-from failuretwin.connection.emulated_arm import EmulatedArm, Emulation
+from failuretwin.connection.emulated_arm import EmulatedArm, Emulation, Shifts
 from failuretwin.connection.links.base import CommandSent, Reading
 from failuretwin.core.movements import Movements, stack_movements
 from failuretwin.core.runs import RunTable, Truth
@@ -52,14 +52,13 @@ class Life:
         """Return the first seconds of a life."""
         commands: list[CommandSent] = []
         readings: list[Reading] = []
-        for event in EmulatedArm(emulation).events():
-            if event.time > seconds:
-                return cls(commands, readings)
+        arm = EmulatedArm(emulation, shifts=Shifts(break_s=0.0, duration_s=seconds))
+        while (event := arm.poll(0.0)) is not None:
             if isinstance(event, CommandSent):
                 commands.append(event)
             else:
                 readings.append(event)
-        raise AssertionError("a life has no end")
+        return cls(commands, readings)
 
     @cached_property
     def starts(self) -> FloatArray:

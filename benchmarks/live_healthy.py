@@ -15,8 +15,7 @@ from telling import per_100_hours
 
 from failuretwin import DigitalTwin
 from failuretwin.app.shadow import Shadow
-from failuretwin.connection.emulated_arm import Emulation, emulated
-from failuretwin.connection.links.replay import Pace
+from failuretwin.connection.emulated_arm import EmulatedArm, Emulation, Shifts
 from failuretwin.core.hypothesis import CLEAR, RAISED, SUSPECTED, Alarm
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -34,7 +33,8 @@ def said_in_error(robot: str, hours: float, seed: int, sensing: str) -> list[Ala
     known = load_calibration(None, robot)
     twin, said, before = DigitalTwin(known.robot), list[Alarm](), CLEAR
     emulation = Emulation(known.robot, known.imperfections, seed=seed)
-    with emulated(emulation, Pace(0.0), 3600.0 * hours) as source:
+    work = Shifts(break_s=0.0, duration_s=3600.0 * hours)
+    with EmulatedArm(emulation, shifts=work) as source:
         shadow = Shadow(source, monitor(twin, sensing=sensing), twin, [])
         while shadow.step(0.1):
             alarm = shadow.snapshot.answer.alarm

@@ -19,7 +19,7 @@ from kept_commands import KeptCommands
 
 from failuretwin import DigitalTwin, load_robot
 from failuretwin.app.shadow import Shadow
-from failuretwin.connection.emulated_arm import Emulation, emulated
+from failuretwin.connection.emulated_arm import EmulatedArm, Emulation, Shifts
 from failuretwin.connection.links.replay import Pace
 from failuretwin.core.hypothesis import RAISED, SUSPECTED, paper_hypotheses
 from failuretwin.decision.streaming.monitor import monitor
@@ -72,7 +72,8 @@ def live(
     commands = KeptCommands()
     said: list[Said] = []
     memory: list[float] = []
-    with emulated(emulation, Pace(speed), seconds) as source:
+    work = Shifts(break_s=0.0, duration_s=seconds)
+    with EmulatedArm(emulation, Pace(speed), work) as source:
         shadow = Shadow(source, monitor(twin), twin, [commands])
         while shadow.step(0.1):
             answer = shadow.snapshot.answer

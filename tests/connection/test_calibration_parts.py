@@ -289,6 +289,7 @@ def test_a_motor_that_hardly_had_to_move_lost_nothing(armpi):
     pose = angles[1:].copy()
     pose[::3, 0] = angles[:-1][::3, 0]
     part = fit_settling(observed(armpi, angles, pose))
+    assert not part.sorted.lost[:, 0].any()
     rates = loss_rates(part.observations, part.sorted.lost, *np.ones((2, 12, 5), dtype=bool), NAMES)
     assert all(rate.punctual.hits == 0 for rate in rates)
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from failuretwin import Fault
-from failuretwin.connection.commanded_arm import PACED_SLICE_S, CommandedArm
-from failuretwin.connection.emulated_arm import Emulation
+from failuretwin.connection.emulated_arm import PACED_SLICE_S, EmulatedArm, Emulation
 from failuretwin.connection.links import replay
 from failuretwin.connection.links.base import CommandSent, Order, Reading
 from failuretwin.connection.links.replay import Pace
@@ -21,7 +20,7 @@ PLAIN = replace(NO_IMPERFECTIONS, name="plain")
 
 def arm_of(robot, imperfections=PLAIN, faults=(), seed=0):
     schedule = tuple(ScheduledFault(Fault(*fault), 0.0) for fault in faults)
-    return CommandedArm(Emulation(robot, imperfections, schedule, seed))
+    return EmulatedArm(Emulation(robot, imperfections, schedule, seed))
 
 
 def wait(arm, seconds):
@@ -71,7 +70,7 @@ def test_by_a_clock_an_order_begins_at_once(armpi, monkeypatch):
     """The time of a slice does not pass before it is due, however long polls may wait."""
     clock = Clock()
     monkeypatch.setattr(replay, "time", clock)
-    arm = CommandedArm(Emulation(armpi, PLAIN), Pace(1.0))
+    arm = EmulatedArm(Emulation(armpi, PLAIN), Pace(1.0))
     while clock.now < 0.4:
         arm.poll(0.01)
     sent = clock.now

@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bag_writers import MONITORING, MONITORING_TEXT, entry, write_bag
-from failuretwin.connection.emulated_arm import Emulation, emulated
+from failuretwin.connection.emulated_arm import EmulatedArm, Emulation, Shifts
 from failuretwin.connection.links import replay as pace
 from failuretwin.connection.links.base import CommandSent, Reading
 from failuretwin.connection.links.replay import Pace, replay
@@ -206,7 +206,8 @@ def test_a_link_counts_what_it_brings_and_says_when_nothing_comes(link):
 
 def test_an_emulated_robot_is_a_link(armpi):
     pytest.importorskip("mujoco")
-    with emulated(Emulation(armpi, NO_IMPERFECTIONS), Pace(0.0), duration_s=4.0) as source:
+    work = Shifts(break_s=0.0, duration_s=4.0)
+    with EmulatedArm(Emulation(armpi, NO_IMPERFECTIONS), shifts=work) as source:
         events = []
         while not source.ended:
             event = source.poll(1.0)

@@ -1,12 +1,10 @@
 from __future__ import annotations
 
-from itertools import takewhile
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from failuretwin.connection.emulated_arm import EmulatedArm, Emulation
+from failuretwin.connection.emulated_arm import EmulatedArm, Emulation, Shifts
 from failuretwin.connection.links import recorder
 from failuretwin.connection.links.base import OK, Answer, CommandSent, Reading
 from failuretwin.connection.links.recorder import Recorder
@@ -21,8 +19,9 @@ pytest.importorskip("mujoco")
 
 
 def events(robot, imperfections, seconds):
-    arm = EmulatedArm(Emulation(robot, imperfections))
-    return list(takewhile(lambda event: event.time < seconds, arm.events()))
+    work = Shifts(break_s=0.0, duration_s=seconds)
+    arm = EmulatedArm(Emulation(robot, imperfections), shifts=work)
+    return list(iter(lambda: arm.poll(0.0), None))
 
 
 def answer(time_, probability=0.25):

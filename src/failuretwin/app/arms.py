@@ -70,9 +70,9 @@ def emulated_arm(
     Raises:
         InputError: If a fault cannot be read, or mujoco is missing.
     """
-    from failuretwin.connection.commanded_arm import CommandedArm
+    from failuretwin.connection.emulated_arm import EmulatedArm
 
-    return CommandedArm(emulation_with(faults, calibrated(robot), seed))
+    return EmulatedArm(emulation_with(faults, calibrated(robot), seed))
 
 
 def known_arm(robot: Robot, calibration: Path | None = None) -> CalibratedRobot:
@@ -212,14 +212,12 @@ def connect(
 
 
 def _emulated(robot: Robot, live: LiveOptions, seed: int, takes_orders: bool) -> Source:
-    from failuretwin.connection.commanded_arm import OperatedArm, Shifts
-    from failuretwin.connection.emulated_arm import emulated
+    from failuretwin.connection.emulated_arm import EmulatedArm, Shifts
 
     emulation = emulation_with(live.faults, known_arm(robot), seed)
     pace, length = Pace(live.speed), live.seconds or math.inf
-    if takes_orders:
-        return OperatedArm(emulation, Shifts(duration_s=length), pace)
-    return emulated(emulation, pace, length)
+    shifts = Shifts(duration_s=length) if takes_orders else Shifts(break_s=0.0, duration_s=length)
+    return EmulatedArm(emulation, pace, shifts)
 
 
 def _log(text: str, robot: Robot, topics: RosTopics, pace: Pace) -> Source:

@@ -11,8 +11,7 @@ from pathlib import Path
 
 from failuretwin.app.commands.options import LiveOptions
 from failuretwin.app.terminal import tell, until_interrupted
-from failuretwin.connection.commanded_arm import CommandedArm
-from failuretwin.connection.emulated_arm import Emulation, emulated
+from failuretwin.connection.emulated_arm import EmulatedArm, Emulation, Shifts
 from failuretwin.connection.links import NETWORKS
 from failuretwin.connection.links.base import CommandSent, Order, Reading, Sink
 from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace
@@ -48,7 +47,7 @@ def obey(target: str, emulation: Emulation, live: LiveOptions) -> None:
             f"--obey takes commands that are stamped by clocks of speed 1, but --speed is "
             f"{live.speed:g}: stamps would not fit the movements. Leave out --speed."
         )
-    topics, arm = load_topics(live.topics), CommandedArm(emulation, Pace())
+    topics, arm = load_topics(live.topics), EmulatedArm(emulation, Pace())
     with open_transport(target) as transport, until_interrupted():
         sink = RosSink(RosWriter(emulation.robot, topics), transport)
         orders = RosSource(emulation.robot, topics, transport)
@@ -76,7 +75,8 @@ def play(target: str, emulation: Emulation, live: LiveOptions) -> None:
         raise InputError(f"--to is {target!r}, expected {places} or a file that ends in .mcap.")
     length = live.seconds or (math.inf if on_network else _file_length(emulation.schedule))
     pace = Pace(live.speed if on_network else AS_FAST_AS_POSSIBLE)
-    source, state, trouble = emulated(emulation, pace, length, zero), "", ""
+    source = EmulatedArm(emulation, pace, Shifts(break_s=0.0, duration_s=length))
+    state = trouble = ""
     with ExitStack() as stack, until_interrupted():
         sink = _sink(target, emulation, live, stack)
         stack.enter_context(source)
@@ -84,14 +84,14 @@ def play(target: str, emulation: Emulation, live: LiveOptions) -> None:
             event = source.poll(1.0)
             if event is None:
                 continue
-            sink.put(event)
+            sink.put(replace(event, time=event.time + zero))
             if sink.trouble != trouble:
                 trouble = sink.trouble
                 tell(trouble or "going on")
-            now = state_at(emulation.schedule, event.time - zero, emulation.robot.motor_names)
+            now = state_at(emulation.schedule, event.time, emulation.robot.motor_names)
             if now != state:
                 state = now
-                tell(f"{event.time - zero:8.1f} s  {state}")
+                tell(f"{event.time:8.1f} s  {state}")
     if sink.trouble:
         raise InputError(sink.trouble)
     if source.ended and not on_network:

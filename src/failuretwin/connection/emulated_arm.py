@@ -1,7 +1,9 @@
-"""Emulated arm: the physics engine's arm with random movements and scheduled faults, without end.
+"""Emulated arm: the physics engine's arm, which takes orders and works by itself, without end.
 
-A leg is the time from one command to the next. The disturbances of the next leg are drawn before
-the readings of this one are made, because a stalled bus loses readings before it delays a command.
+An order is carried out at once, unless the bus stalls: then readings stop, and the order waits
+until the bus answers. A motor whose target does not change keeps its place. An arm at work moves at
+random; its own commands keep the stamps of the time at which they were sent, as those of a program
+that a stalled bus holds up.
 """
 
 from __future__ import annotations
@@ -9,17 +11,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import takewhile
 
 import numpy as np
 
-from failuretwin.connection.links.base import CommandSent, Event, Reading
-from failuretwin.connection.links.replay import Pace, PacedSource
+from failuretwin.connection.links.base import CommandSent, Event, Order, Reading
+from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace, PacedSource, Wait
+from failuretwin.connection.links.stream_time import Ramp
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.disturbances import (
     Disturbances,
-    actual_movements,
     draw_disturbances,
     lagged,
     sense,
@@ -39,9 +40,15 @@ from failuretwin.failure_behavior.registry import MODES
 STEP_S = 0.01
 """Step of the arm's time grid [s]."""
 FIRST_COMMAND_S = 1.0
-"""Time at rest before the first command [s]."""
+"""Time at rest before the first command of an arm at work [s]."""
 MEMORY_S = 6.0
 """Length of past reference that lag and play depend on [s]; longer than any movement."""
+SLICE_S, PACED_SLICE_S = 0.1, 0.05
+"""Length of a slice, as fast as possible and by a clock; an order may wait this long [s]."""
+UNMOVED_RAD = 1e-9
+"""Largest difference of targets that count as equal [rad]."""
+OPERATOR = 1
+"""Number of the operator's random stream, apart from the arm's own."""
 
 
 @dataclass(frozen=True)
@@ -66,37 +73,45 @@ class Emulation:
 
 
 @dataclass(frozen=True)
-class _Leg:
-    """One movement and the time until the next.
+class Shifts:
+    """Working hours of an arm.
 
     Attributes:
-        time: Grid from the present to the next command, (time,) [s].
-        movement: The movement as commanded, as one run with one movement.
-        chance: Disturbances of this run.
-        late: Delay of its start [s].
-        faults: The faults that act, or acted within `MEMORY_S`.
+        movements: Random movements of a shift.
+        break_s: Time from the last of them to the next shift [s]; 0: it works without a break.
+        duration_s: Time after which the arm ends [s].
     """
 
-    time: FloatArray
-    movement: Movements
-    chance: Disturbances
-    late: float
-    faults: Injection
+    movements: int = 12
+    break_s: float = 30.0
+    duration_s: float = math.inf
 
 
-class EmulatedArm:
-    """Arm that moves at random without end; the same seed gives the same life, whatever fails.
+class EmulatedArm(PacedSource):
+    """Emulated arm; the same seed gives the same arm and the same work, whatever fails.
+
+    Time passes in slices when the arm is polled. Disturbances are drawn per slice, so they differ
+    by a clock and as fast as possible. An arm that works without a break needs no slices: they last
+    from one of its commands to the next.
 
     Args:
         emulation: Its settings.
+        pace: Clock of its time; None: as fast as possible.
+        shifts: Its working hours. In the breaks it is free for the orders of others, which the
+            operator does not notice. None: it moves by the orders of others alone, without end.
 
     Raises:
         InputError: If mujoco is missing.
     """
 
-    def __init__(self, emulation: Emulation) -> None:
-        self._emulation = emulation
+    def __init__(
+        self, emulation: Emulation, pace: Pace | None = None, shifts: Shifts | None = None
+    ) -> None:
+        pace = pace or Pace(AS_FAST_AS_POSSIBLE)
+        super().__init__(f"emulated {emulation.robot.name}", self._slices(), pace)
+        self._emulation, self._shifts = emulation, shifts
         self._rng, self._rng_of_faults = np.random.default_rng(emulation.seed).spawn(2)
+        self._rng_of_operator = np.random.default_rng([emulation.seed, OPERATOR])
         imperfections = vary(emulation.imperfections, self._rng)
         if imperfections.readings is not None:
             readings = replace(imperfections.readings, drawn_out=False)
@@ -106,21 +121,128 @@ class EmulatedArm:
         self._self = self._upcoming = self._draw()
         self._magnitude: dict[ScheduledFault, float] = {}
         self._episodes: dict[ScheduledFault, EndlessEpisodes] = {}
-        self._index = 0
-        self._start = FIRST_COMMAND_S
-        self._next_reading = 0.0
+        self._index, self._next_reading = 0, 0.0
         motors = len(emulation.robot.motors)
         self._commanded = np.zeros(motors) + np.asarray(emulation.start or 0.0)
-        self._goal = self._commanded
+        self._goal = self._ordered = self._commanded
         self._told = (self._commanded + self._self.bias + self._self.scatter[0])[None]
+        self._ramp = Ramp(0.0, self._told[-1], self._told[-1], np.zeros(motors))
+        self._waiting: list[tuple[Order, float | None]] = []
+        self._silent = (np.inf, np.inf)
+        self._slice_s = SLICE_S if pace.speed == AS_FAST_AS_POSSIBLE else PACED_SLICE_S
+        if shifts is not None and shifts.break_s == 0.0:
+            self._slice_s = 0.5 * MEMORY_S
+        self._made = 0
+        self._work_s = math.inf if shifts is None else FIRST_COMMAND_S
         engine = PhysicsEngine(emulation.robot)
         self._arm = LiveArms(engine, self._told, STEP_S, np.atleast_1d(self._self.payload))
 
-    def events(self) -> Iterator[Event]:
-        """Yield readings and commands in the order of their times, without end."""
-        while True:
-            leg = self._next_leg()
-            yield from sorted(self._live_through(leg), key=lambda event: event.time)
+    @property
+    def standing(self) -> FloatArray:
+        """Last target of the motors, (motor,) [rad]."""
+        return self._ordered
+
+    @property
+    def angle(self) -> FloatArray:
+        """True angles of the motors, (motor,) [rad]; for judging results only."""
+        return self._arm.angle[0]
+
+    def send(self, order: Order) -> None:
+        """Take an order; it begins with the next slice, or when the bus answers again."""
+        self._take(order, None)
+
+    def _take(self, order: Order, sent_s: float | None) -> None:
+        self._waiting.append((order, sent_s))
+        self._ordered = order.target
+
+    @property
+    def _now(self) -> float:
+        return self._index * STEP_S
+
+    def _slices(self) -> Iterator[Event | Wait]:
+        """Yield the events of slices, each of which passes when it is due."""
+        end_s = math.inf if self._shifts is None else self._shifts.duration_s
+        while self._index < end_s / STEP_S - 1e-6:
+            yield Wait(self._now)
+            if self._now > self._work_s - 0.5 * STEP_S:
+                self._work()
+            yield from self._pass(end_s)
+
+    def _work(self) -> None:
+        """Order the next random movement of a shift."""
+        robot, schedule = self._emulation.robot, self._imperfections.schedule
+        movements = RandomMovements(count=1)
+        drawn = movements.draw(robot, schedule, self._rng_of_operator, self._ordered)
+        self._work_s = math.inf  # until the movement has begun
+        self._take(Order(drawn.target[0, 0], drawn.ramp_duration[0, 0]), self._now)
+
+    def _pass(self, end_s: float) -> list[Event]:
+        """Let one slice of time pass, and return its events."""
+        now, events = self._now, list[Event]()
+        if self._waiting and not self._silent[0] <= now < self._silent[1]:
+            events.append(self._begin(*self._waiting.pop(0)))
+        last = min(now + self._slice_s, self._work_s, end_s)
+        if self._waiting and now < self._silent[1]:
+            last = min(last, self._silent[1])
+        steps = max(1, round((last - now) / STEP_S))
+        time = as_floats(np.arange(self._index, self._index + steps + 1) * STEP_S)
+        drawn = self._draw()
+        faults = self._injection(now - MEMORY_S, float(time[-1]))
+        return [*events, *self._read(self._follow(time, faults), time, drawn)]
+
+    def _begin(self, order: Order, sent_s: float | None) -> CommandSent:
+        """Begin an order, with its disturbances and faults; return it as it was sent.
+
+        Args:
+            order: The order.
+            sent_s: When the operator sent it [s]; None: it is another's, which is sent now.
+        """
+        now, drawn, self._upcoming = self._now, self._upcoming, self._draw()
+        movement = Movements(
+            self._commanded[None],
+            order.target[None, None],
+            order.duration[None, None],
+            np.array([[now]]),
+        )
+        faults = self._injection(now, now + 1.0)
+        faulty, lost = faults.on_movements(movement, drawn.lost[None, 1:])
+        here = self._ramp.at(now)
+        aim = faulty.target[0, 0] + self._self.bias + drawn.scatter[2]
+        stays = lost[0, 0] | (np.abs(order.target - self._commanded) < UNMOVED_RAD)
+        duration = faulty.ramp_duration[0, 0] * (1.0 - self._self.shortening)
+        self._ramp = Ramp(now + float(self._self.delay), here, np.where(stays, here, aim), duration)
+        self._commanded = np.where(lost[0, 0], self._commanded, order.target)
+        self._goal = np.where(lost[0, 0], self._goal, order.target)
+        late, period = float(self._upcoming.late[1]), self._imperfections.schedule.period_s
+        if late > 0.0:
+            begin = now + float(drawn.gap_start[1])
+            self._silent = begin, max(begin, now + 0.5 * sum(period)) + late
+        if sent_s is None:
+            return CommandSent(now, order.target, order.duration)
+        self._plan_work(now)
+        return CommandSent(sent_s, order.target, order.duration)
+
+    def _plan_work(self, now: float) -> None:
+        """Plan the movement after one of a shift that begins now [s]."""
+        assert self._shifts is not None
+        period = self._rng_of_operator.uniform(*self._imperfections.schedule.period_s)
+        self._work_s, self._made = now + float(period), self._made + 1
+        if self._made % self._shifts.movements == 0:
+            self._work_s += self._shifts.break_s
+
+    def _read(
+        self, position: FloatArray, time: FloatArray, drawn: Disturbances
+    ) -> Iterator[Reading]:
+        """Yield the readings of a slice, by the true angles (time, motor) [rad]."""
+        local, zero = time - time[0], np.zeros((1, 1))
+        chance = stack([self._with_readings(drawn, time)])
+        chance = replace(chance, stalled=np.array([False]), late=zero, gap_start=zero)
+        readings = self._imperfections.readings
+        measured, angle = sense(self._twin, readings, position[None], local, zero, chance)
+        seen = np.isfinite(angle[0]).any(axis=1) & (local > 0.0)
+        seen &= ~((time >= self._silent[0]) & (time < self._silent[1]))
+        for k in np.flatnonzero(seen):
+            yield Reading(float(time[k]), measured[0, k], angle[0, k], self._goal)
 
     def _draw(self) -> Disturbances:
         """Draw the disturbances of two movements. The second is used: the first is never late."""
@@ -128,47 +250,8 @@ class EmulatedArm:
         longest = FIRST_COMMAND_S + self._imperfections.schedule.period_s[1] + timing.late_s[1]
         return draw_disturbances(self._imperfections, self._emulation.robot, 2, longest, self._rng)
 
-    def _next_leg(self) -> _Leg:
-        drawn, self._upcoming = self._upcoming, self._draw()
-        schedule = self._imperfections.schedule
-        late = float(drawn.late[1])
-        following = self._start + late + float(self._rng.uniform(*schedule.period_s))
-        time = np.arange(self._index, round(following / STEP_S) + 1) * STEP_S
-        movement = RandomMovements(count=1).draw(
-            self._emulation.robot, schedule, self._rng, self._commanded
-        )
-        movement = replace(movement, start=np.array([[self._start]]))
-        self._start = following
-        chance = self._chance_of(drawn, as_floats(time))
-        return _Leg(
-            as_floats(time),
-            movement,
-            chance,
-            late,
-            self._injection(float(time[0]) - MEMORY_S, float(time[-1])),
-        )
-
-    def _chance_of(self, drawn: Disturbances, time: FloatArray) -> Disturbances:
-        """Return the disturbances of one run with one movement, by the leg's own time."""
-        here = self._told[-1] - self._commanded - self._self.bias
-        chance = replace(
-            drawn,
-            bias=self._self.bias,
-            compliance=self._self.compliance,
-            friction=np.zeros_like(self._self.friction),  # the gears have their own
-            delay=self._self.delay,
-            lag=self._self.lag,
-            shortening=self._self.shortening,
-            lost=drawn.lost[1:],
-            scatter=np.stack([here, drawn.scatter[2]]),
-            late=drawn.late[1:],
-            stalled=np.asarray(self._upcoming.late[1] > 0.0),
-            gap_start=drawn.gap_start[1:],
-        )
-        return stack([self._with_readings(chance, time)])
-
     def _with_readings(self, chance: Disturbances, time: FloatArray) -> Disturbances:
-        """Return the disturbances with the readings of this leg, evenly spaced across legs."""
+        """Return the disturbances with the readings of a slice, evenly spaced across slices."""
         readings = self._imperfections.readings
         if readings is None:
             return chance
@@ -214,50 +297,18 @@ class EmulatedArm:
         course = Course(INTERMITTENT, scheduled.start_s, episodes=episodes)
         return FaultValue(scheduled.fault, endless.share, course)
 
-    def _live_through(self, leg: _Leg) -> list[Event]:
-        before = self._goal
-        position = self._move(leg)
-        local = leg.time - leg.time[0]
-        # The bus answers between two stalls in a row; otherwise it would be silent for minutes.
-        start = leg.movement.start - leg.time[0] + leg.late
-        readings = self._imperfections.readings
-        measured, angle = sense(self._twin, readings, position[None], local, start, leg.chance)
-        stalled = float(start[0, 0]) if leg.late > 0.0 else 0.0
-        seen = np.isfinite(angle[0]).any(axis=1) & (local > 0.0) & (local >= stalled)
-        movement = leg.movement
-        came = leg.time >= movement.start[0, 0] + leg.late
-        goal = np.where(came[:, None], self._goal, before)
-        events: list[Event] = [
-            Reading(float(leg.time[k]), measured[0, k], angle[0, k], goal[k])
-            for k in np.flatnonzero(seen)
-        ]
-        command = CommandSent(
-            float(movement.start[0, 0]), movement.target[0, 0], movement.ramp_duration[0, 0]
-        )
-        return [*events, command]
-
-    def _move(self, leg: _Leg) -> FloatArray:
-        """Move through a leg and return the angles on its grid, (time, motor) [rad]."""
-        faulty, lost = leg.faults.on_movements(leg.movement, leg.chance.lost)
-        told = actual_movements(faulty, replace(leg.chance, lost=lost)).reference(leg.time)[0]
-        self._commanded = np.where(lost[0, 0], self._commanded, faulty.target[0, 0])
-        self._goal = np.where(lost[0, 0], self._goal, leg.movement.target[0, 0])
-        return self._follow(told, leg.time, leg.chance.lag, leg.faults)
-
-    def _follow(
-        self, told: FloatArray, time: FloatArray, lag: FloatArray, faults: Injection
-    ) -> FloatArray:
-        """Follow a reference and return the angles on its grid, (time, motor) [rad].
+    def _follow(self, time: FloatArray, faults: Injection) -> FloatArray:
+        """Follow the present ramp and return the angles on its grid, (time, motor) [rad].
 
         Args:
-            told: The reference from the present on, (time, motor) [rad].
             time: Grid, (time,) [s].
-            lag: First-order lag, (1,) [s].
             faults: The faults that act.
         """
         self._index += len(time) - 1
-        self._told = np.concatenate([self._told, told[1:]])[-round(MEMORY_S / STEP_S) :]
+        told = np.concatenate([self._told, self._ramp.at(time[1:])])
+        self._told = told[-round(MEMORY_S / STEP_S) :]
         grid = time[-1] - np.arange(len(self._told))[::-1] * STEP_S
+        lag = np.asarray(self._self.lag)[None]
         followed = faults.on_reference(lagged(self._told[None], grid, lag), as_floats(grid))
         held, weakness = faults.held(time), faults.weakness(time)
         before = self._arm.angle
@@ -267,22 +318,3 @@ class EmulatedArm:
             None if weakness is None else weakness[:, 1:],
         )
         return np.concatenate([before, angles[0]])
-
-
-def emulated(
-    emulation: Emulation, pace: Pace, duration_s: float = math.inf, zero_s: float = 0.0
-) -> PacedSource:
-    """Return an emulated robot as a source.
-
-    Args:
-        emulation: Settings of the arm.
-        pace: Clock of the events.
-        duration_s: Time after which it ends [s].
-        zero_s: Its clock at the start [s].
-
-    Raises:
-        InputError: If mujoco is missing.
-    """
-    events = takewhile(lambda event: event.time <= duration_s, EmulatedArm(emulation).events())
-    stamped = (replace(event, time=event.time + zero_s) for event in events)
-    return PacedSource(f"emulated {emulation.robot.name}", stamped, pace)

@@ -5,7 +5,7 @@ by its settled error; an offset adds to it:
 
     reading - command = offset + bias + compliance * load - friction * direction + scatter
 
-Offset, bias and friction are normal and integrated out exactly, compliance and scatter on a grid.
+Offset, bias, friction and compliance are normal and integrated out exactly, scatter on a grid.
 
 Section: docs/reading_logs.md#joint-offsets
 """
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.special import logsumexp, softmax
 
 from failuretwin.core.hypothesis import SURE, Interval
 from failuretwin.core.types import FloatArray, as_floats
@@ -35,11 +36,14 @@ TRAVEL_RAD = 0.02
 FEWEST_STOPS = 4
 FOLLOWS = 0.5
 """A joint follows its command if its errors spread by less than this share of the commands'."""
-COMPLIANCE_SPREAD, SCATTER_SPREAD = 1.0, 0.7
-"""Prior deviations of the logarithms of compliance and scatter; assumed, wider than within a class:
-recording programs set gains of their own, and hands hold objects."""
+SAG_SPREAD, SCATTER_SPREAD = 1.5, 0.7
+"""Prior deviations of the compliance, as a share of that of the class, and of the logarithm of the
+scatter; assumed, wider than within a class: recording programs set gains of their own, and hands
+hold objects."""
 OFFSET_RAD = 0.2
 """Prior deviation of an offset [rad]."""
+Z_90 = 1.645
+"""Half the 90 % interval of a normal distribution, in standard deviations."""
 NODES = np.linspace(-2.5, 2.5, 21)
 """Nodes of a standard normal distribution."""
 
@@ -105,8 +109,8 @@ def joint_offsets(runs: xr.Dataset, robot: Robot, known: Imperfections) -> tuple
         if len(at) < FEWEST_STOPS or errors.std() > FOLLOWS * at[:, k].std():
             continue
         load = sag(robot, at, np.asarray(settling.compliance), settling.payload)[:, k]
-        rows = np.stack([np.ones(len(at)), -np.array(stops.direction)], axis=1)
-        found.append(_offset(motor, k, errors, rows, load, settling, variation))
+        rows = np.stack([np.ones(len(at)), -np.array(stops.direction), load], axis=1)
+        found.append(_offset(motor, k, errors, rows, settling, variation))
     return tuple(found)
 
 
@@ -152,13 +156,7 @@ def _still(asked: FloatArray, seen: FloatArray, time: FloatArray) -> list[tuple[
 
 
 def _offset(
-    motor: str,
-    k: int,
-    errors: FloatArray,
-    rows: FloatArray,
-    load: FloatArray,
-    settling: Settling,
-    variation: Variation,
+    motor: str, k: int, errors: FloatArray, rows: FloatArray, settling: Settling, doubt: Variation
 ) -> JointOffset:
     """Return the offset of motor `k` from its errors (stop,) [rad] at its stops.
 
@@ -166,52 +164,43 @@ def _offset(
         motor: Its name.
         k: Its number in the chain.
         errors: Reading minus command, (stop,) [rad].
-        rows: Factors of offset and friction, (stop, 2).
-        load: Sag of the class, (stop,) [rad].
+        rows: Factors of constant error, friction and sag of the class, (stop, 3).
         settling: Settled errors of the class.
-        variation: Their variation within it.
+        doubt: Their variation within it.
     """
-    from scipy.special import ndtr
-
-    mean = np.array([settling.bias[k], settling.friction[k]])
-    spread = np.array([variation.bias[k], (variation.friction or variation.bias)[k]])
-    sag_factor, scatter_factor = np.exp([COMPLIANCE_SPREAD * NODES, SCATTER_SPREAD * NODES])
-    prior = -0.5 * (NODES[:, None] ** 2 + NODES**2)
-    wide = np.hypot(spread, [OFFSET_RAD, 0.0])
-    log_healthy, log_off = np.empty((2, *prior.shape))
-    centre, width = np.empty((2, *prior.shape))
-    for at in np.ndindex(prior.shape):
-        left = errors - sag_factor[at[0]] * load - rows @ mean
-        scatter = scatter_factor[at[1]] * settling.scatter[k]
-        log_healthy[at] = _fit(left, rows, spread, scatter)[0]
-        log_off[at], centre[at], width[at] = _fit(left, rows, wide, scatter)
-    top = max(float((prior + log_off).max()), float((prior + log_healthy).max()))
-    weight = np.exp(prior + log_off - top)
-    odds = EncoderBias.prior_odds * weight.sum() / np.exp(prior + log_healthy - top).sum()
-    weight /= weight.sum()
-    width = np.hypot(width, spread[0])  # a healthy motor has a bias, too
-    size = float(np.sum(weight * centre))
-    grid = size + np.linspace(-1.0, 1.0, 4001) * 8.0 * float(np.max(width))
-    below = np.einsum("cs,csg->g", weight, ndtr((grid - centre[..., None]) / width[..., None]))
-    low, high = np.interp([0.05, 0.95], below, grid)
+    friction = (doubt.friction or doubt.bias)[k]
+    left = errors - rows @ [settling.bias[k], settling.friction[k], 1.0]
+    spread = np.array([doubt.bias[k], friction, SAG_SPREAD])
+    wide = np.hypot(spread, [OFFSET_RAD, 0.0, 0.0])
+    scatter = settling.scatter[k] * np.exp(SCATTER_SPREAD * NODES)
+    log_healthy, _, _ = _fit(left, rows, spread, scatter)
+    log_off, centre, width = _fit(left, rows, wide, scatter)
+    odds = EncoderBias.prior_odds * float(np.exp(logsumexp(log_off) - logsumexp(log_healthy)))
+    weight = softmax(log_off)
+    size = float(weight @ centre)
+    # A healthy motor has a constant error, too.
+    deviation = float(np.sqrt(weight @ (width**2 + (centre - size) ** 2) + spread[0] ** 2))
     third = (len(errors) + 2) // 3
     change = abs(float(np.median(errors[:third]) - np.median(errors[-third:])))
-    sure, steady = float(odds / (1.0 + odds)), change < 0.5 * abs(size)
-    return JointOffset(motor, size, (float(low), float(high)), sure, len(errors), steady)
+    sure, steady = odds / (1.0 + odds), change < 0.5 * abs(size)
+    interval = size - Z_90 * deviation, size + Z_90 * deviation
+    return JointOffset(motor, size, interval, sure, len(errors), steady)
 
 
 def _fit(
-    left: FloatArray, rows: FloatArray, spread: FloatArray, scatter: float
-) -> tuple[float, float, float]:
-    """Return log evidence, mean and deviation of the first factor: (stop,) errors of normal rows.
+    left: FloatArray, rows: FloatArray, spread: FloatArray, scatter: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return log evidence, mean and deviation of the first factor for each scatter, (node,) each.
 
     left = rows @ theta + scatter * normal,    theta = spread * normal
     """
-    root = rows * spread
-    precision = root.T @ root / scatter**2 + np.eye(2)
+    root = (rows * spread) / scatter[:, None, None]
+    left = left / scatter[:, None]
+    precision = np.swapaxes(root, 1, 2) @ root + np.eye(len(spread))
     covariance = np.linalg.inv(precision)
-    pull = root.T @ left / scatter**2
-    fit = left @ left / scatter**2 - pull @ covariance @ pull
-    log_evidence = -0.5 * (fit + np.linalg.slogdet(precision)[1]) - len(left) * np.log(scatter)
-    mean, deviation = (covariance @ pull)[0], np.sqrt(covariance[0, 0])
-    return float(log_evidence), float(spread[0] * mean), float(spread[0] * deviation)
+    pull = np.einsum("nst,ns->nt", root, left)
+    mean = np.einsum("ntu,nu->nt", covariance, pull)
+    fit = np.sum(left**2, axis=1) - np.sum(pull * mean, axis=1)
+    log_evidence = -0.5 * (fit + np.linalg.slogdet(precision)[1] + NODES**2)
+    log_evidence -= left.shape[1] * np.log(scatter)
+    return log_evidence, spread[0] * mean[:, 0], spread[0] * np.sqrt(covariance[:, 0, 0])

@@ -24,7 +24,7 @@ from failuretwin.connection.population import Population, stated_variation
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.movements import Movements
-from failuretwin.core.runs import check_motors, truth_of
+from failuretwin.core.runs import check_motors, truths_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.digital_model.arm_classes import generic_imperfections
@@ -164,16 +164,13 @@ class SelfCalibratingDiagnoser:
         evidence = seen.sound.settled
         likelihood = RunLikelihood(evidence, model)
         found = folder_posterior(likelihood, bayes.hypothesis_set, bayes.priors, advance)
-        names = [str(name) for name in runs["run"].values]
-        truth = truth_of(runs)
-        truths = [None] * len(names) if truth is None else list(truth)
-        diagnoses: list[Diagnosis] = []
-        for posterior in found.posteriors:
-            first = len(diagnoses)
-            for at in range(len(posterior.log_posterior)):
-                run = first + at
-                told = posterior.to_diagnosis(at, names[run], seen.quality[run], truths[run])
-                diagnoses.append(replace(told, protocol="P1", method=_method(robot)))
+        names, truth = [str(name) for name in runs["run"].values], truths_of(runs)
+        judged = [(one, at) for one in found.posteriors for at in range(len(one.log_posterior))]
+        told = [
+            posterior.to_diagnosis(at, names[run], seen.quality[run], truth[run])
+            for run, (posterior, at) in enumerate(judged)
+        ]
+        diagnoses = [replace(one, protocol="P1", method=_method(robot)) for one in told]
         learned = as_calibration(found, believed, robot, runs)
         prior = np.exp(log_prior(bayes.hypothesis_set, bayes.priors))
         return SelfCalibration(diagnoses, learned, prior, found.taught)

@@ -25,7 +25,7 @@ from failuretwin.connection.self_calibration import (
 )
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.core.runs import check_motors, truth_of
+from failuretwin.core.runs import check_motors, truths_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
@@ -212,21 +212,19 @@ class _Seen:
         diagnoser: How to diagnose.
         seen: What they say.
         evidence: Settled positions.
-        given: What was believed of the robot at the beginning.
     """
 
     runs: xr.Dataset
     diagnoser: BayesDiagnoser
     seen: Evidence
     evidence: SettledEvidence
-    given: Imperfections
 
     @classmethod
     def of(cls, runs: xr.Dataset, diagnoser: BayesDiagnoser, life: LifeFilter) -> _Seen:
         seen = Evidence(runs, life.model.settings)
         evidence = seen.sound.settled
         check_moves(evidence.movements)
-        return cls(runs, diagnoser, seen, evidence, life.model.imperfections)
+        return cls(runs, diagnoser, seen, evidence)
 
     @property
     def names(self) -> list[str]:
@@ -253,11 +251,9 @@ class _Seen:
             counts = self.diagnoser.transient_mask(self.evidence.usable)
             moving = self.seen.sound.transient.where(counts)[batch]
         posterior = life.follow(evidence, moving)
-        truth = truth_of(self.runs)
+        truth, quality = truths_of(self.runs), self.seen.quality
         return [
-            posterior.to_diagnosis(
-                at, self.names[run], self.seen.quality[run], None if truth is None else truth[run]
-            )
+            posterior.to_diagnosis(at, self.names[run], quality[run], truth[run])
             for at, run in enumerate(batch.tolist())
         ]
 

@@ -406,3 +406,9 @@ def unique_names(names: Sequence[str]) -> list[str]:
 def truth_of(runs: xr.Dataset) -> list[str] | None:
     """Return the true hypothesis of every run, or None where the run set has none."""
     return [str(f) for f in runs["fault"].values] if "fault" in runs else None
+
+
+def truths_of(runs: xr.Dataset) -> list[str | None]:
+    """Return the true hypothesis of every run; None where it is not known."""
+    known = truth_of(runs)
+    return [None] * runs.sizes["run"] if known is None else [*known]

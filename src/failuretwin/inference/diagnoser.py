@@ -19,7 +19,7 @@ import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, paper_hypotheses, parse_hypotheses
-from failuretwin.core.runs import check_motors, check_runs, truth_of
+from failuretwin.core.runs import check_motors, check_runs, truths_of
 from failuretwin.core.types import BoolArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.digital_model.arm_classes import class_name as arm_class_of
@@ -162,8 +162,7 @@ class BayesDiagnoser:
         set_ups = told.set_ups()
         seen = [told.under(one.set_up.correction) for one in set_ups.found]
         moving = [self._moving(one) for one in seen]
-        names, faults = [str(name) for name in runs["run"].values], truth_of(runs)
-        truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
+        names, truth = [str(name) for name in runs["run"].values], truths_of(runs)
         results, quality = [], seen[0].evidence.quality
         chunk = _runs_at_a_time(seen[0].settled.movements.start.shape[1])
         for first in range(0, len(names), chunk):
@@ -316,14 +315,13 @@ class _Completed:
         Raises:
             InputError: If that is not what the class returns.
         """
-        told, faults = self.diagnoser.diagnose(runs), truth_of(runs)
+        told, truth = self.diagnoser.diagnose(runs), truths_of(runs)
         found = list(told) if isinstance(told, Iterable) else []
         count = runs.sizes["run"]
         if len(found) != count or not all(isinstance(d, Diagnosis) for d in found):
             raise InputError(f"{self.name}: diagnose(runs) gave no Diagnosis for each of {count}.")
         if [d.run for d in found] != [str(name) for name in runs["run"].values]:
             raise InputError(f"{self.name}: its diagnoses do not name the runs, in their order.")
-        truth: Sequence[str | None] = [None] * count if faults is None else faults
         made = [
             replace(d, truth=true, posterior=self._posterior(d))
             for d, true in zip(found, truth, strict=True)

@@ -10,8 +10,7 @@ import pytest
 from small_world import task_of
 
 from failuretwin import Fault
-from failuretwin.connection.commanded_arm import CommandedArm
-from failuretwin.connection.emulated_arm import Emulation
+from failuretwin.connection.emulated_arm import EmulatedArm, Emulation
 from failuretwin.connection.links.base import CommandSent, LinkCounts, Order, Reading
 from failuretwin.core.errors import InputError
 from failuretwin.decision.acting import work as work_module
@@ -155,7 +154,7 @@ def test_a_tool_that_never_rests_is_not_seen(model):
 def test_an_emulated_arm_with_a_stuck_motor(model, armpi):
     pytest.importorskip("mujoco")
     schedule = (ScheduledFault(Fault("motor_3", "stuck"), 6.0),)
-    arm = CommandedArm(Emulation(armpi, model.imperfections, schedule, 2))
+    arm = EmulatedArm(Emulation(armpi, model.imperfections, schedule, 2))
     work, said = work_of(model, arm, task_of(armpi, 7, 5), Judge(model))
     work.carry_out()
     assert str(work.actor.belief.believed.fault) == "motor_3:stuck"

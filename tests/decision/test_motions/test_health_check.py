@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import failuretwin as ft
-from failuretwin.connection.commanded_arm import CommandedArm
-from failuretwin.connection.emulated_arm import Emulation
+from failuretwin.connection.emulated_arm import EmulatedArm, Emulation
 from failuretwin.connection.links.base import Order
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
 from failuretwin.decision.acting.believed_arm import Seen
@@ -145,7 +144,7 @@ def test_a_motor_that_carries_nothing_is_not_asked_for_its_strength(model):
 def carried_out(known, gate, designed, schedule, modes=None, further=0):
     emulation = Emulation(known.robot, known.imperfections, schedule, 3, modes or {})
     motions = Motions.of(known.robot, designed)
-    with CommandedArm(emulation) as arm:
+    with EmulatedArm(emulation) as arm:
         check = Checking(known, gate).health_check(motions, further)
         return check.work(arm, lambda _: None), check
 
@@ -314,7 +313,7 @@ def test_in_one_call(known):
     pytest.importorskip("mujoco")
     fault = Hypothesis.parse("motor_3:stuck")
     schedule = (ScheduledFault(fault.faults[0], 0.0),)
-    with CommandedArm(Emulation(known.robot, known.imperfections, schedule, 1)) as arm:
+    with EmulatedArm(Emulation(known.robot, known.imperfections, schedule, 1)) as arm:
         found = ft.check(arm, seconds=8.0, tell=lambda _: None)
     assert (found.light, found.motor) == ("red", "motor_3")
     assert found.diagnosis.diagnosis == "motor_3:stuck"

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from failuretwin.connection.calibration.result import Parameter
+from failuretwin.connection.student_fit import fit_student
 from failuretwin.core.movements import find_movements
 from failuretwin.core.numerics import Covariance
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
 
 FAR = 20.0
 """A constant error is looked for within so many times its usual doubt, or its noise."""
-ROUNDS = 20
-"""Rounds of weighing; each moves the fit by a fraction of the one before."""
 LEAST_MOVEMENTS = 5
 """Fewer settled movements say nothing of a sensor."""
 RESTLESS = 4.0
@@ -82,12 +81,19 @@ def _fit(runs: xr.Dataset, model: HealthyModel, sensor: Sensor) -> SensorFit | N
         return None
     value, jacobian = plain.expected(pose)
     turns = before.turn_doubt > 0.0 and plain.dims == plain.channels == 3
-    columns = _columns(plain, value, turns)
     errors = plain.dims
     far = FAR * max(plain.usual_doubt, noise)
     prior = np.concatenate([np.full(errors, far), np.full(3 * turns, before.turn_doubt)])
-    root = jacobian * model.scatter
-    estimate, deviation = _robust(seen - value, columns, root, noise, prior, plain.dims)
+    white = Covariance.of(jacobian * model.scatter, noise**2, errors).inverse_root
+
+    def residual(x: FloatArray) -> FloatArray:
+        error, turn = np.split(x * prior, [errors])
+        shown = plain.to_channels(plain.with_errors(value, np.tile(error, (len(seen), 1))))
+        shown = shown + np.cross(turn, value) if turns else shown
+        return np.asarray(np.einsum("mij,mj->mi", white, seen - shown))
+
+    told = fit_student(residual, np.zeros(len(prior)), errors)
+    estimate, deviation = told.value * prior, np.sqrt(np.diag(told.covariance)) * prior
     bias, turn = estimate[:errors], estimate[errors:]
     mount = Rotation.from_euler("xyz", before.rpy)
     if turns:
@@ -102,20 +108,6 @@ def _fit(runs: xr.Dataset, model: HealthyModel, sensor: Sensor) -> SensorFit | N
         rpy=(float(roll), float(pitch), float(yaw)) if turns else before.rpy,
     )
     return SensorFit(found, len(seen), _parameters(plain, estimate, deviation, (noise, noise_sd)))
-
-
-def _columns(sensor: Sensor, value: FloatArray, turns: bool) -> FloatArray:
-    """Return the derivative of the channels by b, and by w, (movement, channel, parameter)."""
-    step, none = 1e-5, np.zeros((len(value), sensor.dims))
-    parts = []
-    for unit in step * np.eye(sensor.dims):
-        moved = sensor.to_channels(sensor.with_errors(value, none + unit))
-        parts.append((moved - value) / step)
-    columns = np.stack(parts, axis=-1)
-    if not turns:
-        return columns
-    about = np.swapaxes(np.cross(np.eye(3), value[:, None, :]), -1, -2)
-    return np.concatenate([columns, about], axis=-1)
 
 
 def _at_rest(
@@ -151,37 +143,6 @@ def _at_rest(
     noise = float(np.median(size[still]))
     doubt = float(MEDIAN_SPREAD * np.std(size[still]) / np.sqrt(still.sum()))
     return np.array(points)[still], np.array(at)[still], max(noise, 1e-9), doubt
-
-
-def _robust(
-    error: FloatArray,
-    columns: FloatArray,
-    root: FloatArray,
-    noise: float,
-    prior: FloatArray,
-    dims: int,
-    dof: float = 4.0,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the parameters and their standard deviations, (parameter,) each.
-
-    Args:
-        error: Seen minus expected, (movement, channel).
-        columns: Derivative by the parameters, (movement, channel, parameter).
-        root: J diag(s), the scatter of the motors, (movement, channel, motor).
-        noise: Of a reading on each channel.
-        prior: Standard deviations beforehand, (parameter,).
-        dims: Dimensions in which channels can differ.
-        dof: Degrees of freedom of the weights.
-    """
-    spread = Covariance.of(root, noise**2, dims)
-    pull = np.stack([spread.solve(columns[..., k]) for k in range(columns.shape[-1])], axis=-1)
-    found = np.zeros(len(prior))
-    for _ in range(ROUNDS):
-        left = error - columns @ found
-        weight = (dof + dims) / (dof + spread.product(left, left))
-        information = np.einsum("m,mck,mcl->kl", weight, columns, pull) + np.diag(prior**-2.0)
-        found = np.linalg.solve(information, np.einsum("m,mck,mc->k", weight, pull, error))
-    return found, np.sqrt(np.diag(np.linalg.inv(information)))
 
 
 def _parameters(

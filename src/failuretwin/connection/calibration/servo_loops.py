@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -87,7 +88,7 @@ def fit_shared(steps: Sequence[StepTest], motor: Motor, rad_per_count: float) ->
     _, mode = problem.solve(mode, problem.excess(mode))
     slopes = problem.slopes(mode, problem.excess(mode))
     covariance = np.linalg.inv(slopes.T @ slopes)
-    misfit = problem.motion.predicted(mode[None])[0] - problem.motion.position
+    misfit = problem.predicted(mode[None])[0] - problem.position
     return SharedFit(
         mode=mode[:SHARED],
         deviation=np.sqrt(np.diag(covariance)[:SHARED]),
@@ -102,98 +103,25 @@ def sizes_differ(steps: Sequence[StepTest]) -> bool:
 
 
 @dataclass(frozen=True)
-class _Motion:
-    """Readings of all steps of a motor, and the model of their motion.
+class _Problem:
+    """Least squares of the readings of all steps of a motor, and of the prior.
 
     The parameters are the shared ones, then for each step its own part of the dead time [s], then
     for each step the error of the level before it [rad], then that of the level after it.
 
     Attributes:
-        reference: Reference as a share of the travel, (step, grid).
-        start: Levels before, (step,) [rad].
-        travel: Signed distances to the levels after, (step,) [rad].
-        time: Times of the readings of each step since its command [s].
-        position: All readings, step by step, (reading,) [rad].
-        deviation: Their standard deviation by rounding and uncertain stamps, (reading,) [rad].
-    """
-
-    reference: FloatArray
-    start: FloatArray
-    travel: FloatArray
-    time: tuple[FloatArray, ...]
-    position: FloatArray
-    deviation: FloatArray
-
-    @classmethod
-    def of(cls, steps: Sequence[StepTest], rad_per_count: float) -> _Motion:
-        windows = [_window(step) for step in steps]
-        time = tuple(step.time[w] for step, w in zip(steps, windows, strict=True))
-        position = [step.position[w] for step, w in zip(steps, windows, strict=True)]
-        speed = np.concatenate([_speed(t, y) for t, y in zip(time, position, strict=True)])
-        grid = np.arange(0.0, max(t[-1] for t in time) + 0.1, GRID_S)
-        return cls(
-            reference=np.stack([np.clip(grid / max(s.duration, GRID_S), 0.0, 1.0) for s in steps]),
-            start=np.array([step.start for step in steps]),
-            travel=np.array([step.travel for step in steps]),
-            time=time,
-            position=np.concatenate(position),
-            deviation=np.hypot(READING_COUNTS * rad_per_count, STAMP_S * speed),
-        )
-
-    def predicted(self, values: FloatArray) -> FloatArray:
-        """Return the readings predicted by sets of parameters, (set, reading) [rad].
-
-        Args:
-            values: (set, parameter).
-        """
-        shared = values[:, :SHARED]
-        delay, before, after = np.moveaxis(values[:, SHARED:].reshape(len(values), 3, -1), 1, 0)
-        late = shared[:, 4:] + delay
-        gains = np.column_stack([shared[:, 0], np.exp(shared[:, 1:3])])
-        reference = (self.travel + after - before)[..., None] * self.reference
-        curves = respond_limited(gains, np.exp(shared[:, 3]), reference, GRID_S)
-        grid = np.arange(curves.shape[-1]) * GRID_S
-        parts = [
-            [
-                level + np.interp(time - shift, grid, curve)
-                for time, level, shift, curve in zip(self.time, *rows, strict=True)
-            ]
-            for rows in zip(self.start + before, late, curves, strict=True)
-        ]
-        return np.stack([np.concatenate(part) for part in parts])
-
-
-def _window(step: StepTest) -> slice:
-    """Return the readings of the motion, with some before and after it."""
-    left = np.abs(step.position - step.settled) / abs(step.travel)
-    arrived = step.time[(step.time > 0.0) & (left < NEAR)]
-    first = int(np.searchsorted(step.time, EARLIEST_S))
-    return slice(first, int(np.searchsorted(step.time, arrived[0] + MARGIN_S)))
-
-
-def _speed(time: FloatArray, position: FloatArray) -> FloatArray:
-    """Return the approximate speed at each reading [rad/s]."""
-    index = np.arange(len(time))
-    ahead = np.minimum(index + SPEED_READINGS, len(time) - 1)
-    behind = np.maximum(index - SPEED_READINGS, 0)
-    return np.abs(position[ahead] - position[behind]) / (time[ahead] - time[behind])
-
-
-@dataclass(frozen=True)
-class _Problem:
-    """Least squares of readings and prior.
-
-    Attributes:
-        motion: Readings and their model.
+        steps: The steps.
         prior: Prior means, (parameter,).
         deviation: Prior standard deviations, (parameter,).
-        steps: Steps of the numerical derivatives, (parameter,).
+        change: Steps of the numerical derivatives, (parameter,).
+        rad_per_count: Size of a count [rad].
     """
 
-    motion: _Motion
+    steps: Sequence[StepTest]
     prior: FloatArray
     deviation: FloatArray
-    steps: FloatArray
+    change: FloatArray
+    rad_per_count: float
 
     @classmethod
     def of(cls, steps: Sequence[StepTest], motor: Motor, rad_per_count: float) -> _Problem:
@@ -207,11 +135,58 @@ class _Problem:
             return np.concatenate([shared, np.full(count, delay), np.full(2 * count, level)])
 
         return cls(
-            motion=_Motion.of(steps, rad_per_count),
-            prior=joined(np.array([loop.P, *logs, PRIOR_DEAD_TIME_S]), 0.0, 0.0),
-            deviation=joined(shared, DEAD_TIME_SCATTER_S, LEVEL_COUNTS * rad_per_count),
-            steps=joined(SHARED_STEPS, SHARED_STEPS[4], rad_per_count),
+            steps,
+            joined(np.array([loop.P, *logs, PRIOR_DEAD_TIME_S]), 0.0, 0.0),
+            joined(shared, DEAD_TIME_SCATTER_S, LEVEL_COUNTS * rad_per_count),
+            joined(SHARED_STEPS, SHARED_STEPS[4], rad_per_count),
+            rad_per_count,
         )
+
+    @cached_property
+    def _read(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Times since the command [s] and angles [rad] that are used, of each step."""
+        windows = [(step, _window(step)) for step in self.steps]
+        return [(step.time[window], step.position[window]) for step, window in windows]
+
+    @cached_property
+    def position(self) -> FloatArray:
+        """All readings, step by step, (reading,) [rad]."""
+        return np.concatenate([position for _, position in self._read])
+
+    @cached_property
+    def reading_deviation(self) -> FloatArray:
+        """Standard deviation of them by rounding and uncertain stamps, (reading,) [rad]."""
+        speed = np.concatenate([_speed(time, position) for time, position in self._read])
+        return np.hypot(READING_COUNTS * self.rad_per_count, STAMP_S * speed)
+
+    @cached_property
+    def _reference(self) -> FloatArray:
+        """Reference as a share of the travel, (step, grid)."""
+        grid = np.arange(0.0, max(time[-1] for time, _ in self._read) + 0.1, GRID_S)
+        return np.stack([np.clip(grid / max(s.duration, GRID_S), 0.0, 1.0) for s in self.steps])
+
+    def predicted(self, values: FloatArray) -> FloatArray:
+        """Return the readings predicted by sets of parameters, (set, reading) [rad].
+
+        Args:
+            values: (set, parameter).
+        """
+        shared = values[:, :SHARED]
+        delay, before, after = np.moveaxis(values[:, SHARED:].reshape(len(values), 3, -1), 1, 0)
+        late = shared[:, 4:] + delay
+        gains = np.column_stack([shared[:, 0], np.exp(shared[:, 1:3])])
+        start, travel = np.array([[step.start, step.travel] for step in self.steps]).T
+        reference = (travel + after - before)[..., None] * self._reference
+        curves = respond_limited(gains, np.exp(shared[:, 3]), reference, GRID_S)
+        grid = np.arange(curves.shape[-1]) * GRID_S
+        parts = [
+            [
+                level + np.interp(time - shift, grid, curve)
+                for (time, _), level, shift, curve in zip(self._read, *rows, strict=True)
+            ]
+            for rows in zip(start + before, late, curves, strict=True)
+        ]
+        return np.stack([np.concatenate(part) for part in parts])
 
     def solve(self, start: FloatArray, excess: float) -> tuple[float, FloatArray]:
         """Return cost and parameters of the best fit near `start`."""
@@ -238,18 +213,18 @@ class _Problem:
             values: All parameters, (parameter,).
             excess: Factor on the variance of readings.
         """
-        misfit = self.motion.predicted(values[None])[0] - self.motion.position
-        readings = misfit / (np.sqrt(excess) * self.motion.deviation)
+        misfit = self.predicted(values[None])[0] - self.position
+        readings = misfit / (np.sqrt(excess) * self.reading_deviation)
         return np.concatenate([readings, (values - self.prior) / self.deviation])
 
     def slopes(self, values: FloatArray, excess: float) -> FloatArray:
         """Return the central differences of `residuals`, (residual, parameter)."""
-        moved = np.diag(self.steps)
+        moved = np.diag(self.change)
         ahead, behind = np.split(
-            self.motion.predicted(np.concatenate([values + moved, values - moved])), 2
+            self.predicted(np.concatenate([values + moved, values - moved])), 2
         )
-        slopes = ((ahead - behind) / (2.0 * self.steps[:, None])).T
-        spread = np.sqrt(excess) * self.motion.deviation
+        slopes = ((ahead - behind) / (2.0 * self.change[:, None])).T
+        spread = np.sqrt(excess) * self.reading_deviation
         return np.concatenate([slopes / spread[:, None], np.diag(1.0 / self.deviation)])
 
     def excess(self, values: FloatArray) -> float:
@@ -258,8 +233,8 @@ class _Problem:
         Variance of the standardised residuals times one plus twice the sum of their correlations,
         with Bartlett's weights, or their variance alone if that is larger.
         """
-        residuals = self.residuals(values, 1.0)[: len(self.motion.position)]
-        ends = np.cumsum([len(time) for time in self.motion.time])[:-1]
+        residuals = self.residuals(values, 1.0)[: len(self.position)]
+        ends = np.cumsum([len(time) for time, _ in self._read])[:-1]
         parts = np.split(residuals, ends)
         variance = float(residuals @ residuals)
         correlated = sum(
@@ -268,3 +243,19 @@ class _Problem:
         )
         degrees = len(residuals) - SHARED - 3 * len(parts)
         return max(1.0, (variance + 2.0 * correlated) / degrees, variance / degrees)
+
+
+def _window(step: StepTest) -> slice:
+    """Return the readings of the motion, with some before and after it."""
+    left = np.abs(step.position - step.settled) / abs(step.travel)
+    arrived = step.time[(step.time > 0.0) & (left < NEAR)]
+    first = int(np.searchsorted(step.time, EARLIEST_S))
+    return slice(first, int(np.searchsorted(step.time, arrived[0] + MARGIN_S)))
+
+
+def _speed(time: FloatArray, position: FloatArray) -> FloatArray:
+    """Return the approximate speed at each reading [rad/s]."""
+    index = np.arange(len(time))
+    ahead = np.minimum(index + SPEED_READINGS, len(time) - 1)
+    behind = np.maximum(index - SPEED_READINGS, 0)
+    return np.abs(position[ahead] - position[behind]) / (time[ahead] - time[behind])

@@ -37,6 +37,8 @@ FEWEST_MOVEMENTS = 6
 SCATTER_PRIOR_SPREAD, DOF_PRIOR_SPREAD = 1.0, 0.7
 """Prior deviations of the logarithms of each scatter and of the degrees of freedom; assumed, wider
 than within a class: healthy logs tell them."""
+LEAST_TRAVEL_RAD = 0.03
+"""Travel below which a motor stays and arrives alike, by its scatter and friction [rad]."""
 WARMING = 2
 """Passes in which scatter and rates stay as believed: until the offsets are nearly found, what is
 left of a movement is no scatter."""
@@ -79,7 +81,7 @@ class SortedMovements:
     """What probably became of healthy movements.
 
     Attributes:
-        lost: Motors that did not get their command, (movement, motor).
+        lost: Motors that had to move and did not get their command, (movement, motor).
         odd: Movements that look like no healthy ones, (movement,).
         log_likelihood: Of all movements together.
     """
@@ -100,7 +102,8 @@ class SortedMovements:
         share = likelihood.outcome_probability[observations.at]
         sound = share.sum(axis=-1)
         missed = (share @ likelihood.outcomes.lost) / np.maximum(sound, 1e-12)[:, None]
-        lost, odd = np.asarray(missed > 0.5), np.asarray(sound < 0.5)
+        travel = np.abs(observations.target - observations.origin)
+        lost, odd = (missed > 0.5) & (travel > LEAST_TRAVEL_RAD), np.asarray(sound < 0.5)
         return cls(lost & ~odd[:, None], odd, float(likelihood.log_healthy.sum()))
 
 

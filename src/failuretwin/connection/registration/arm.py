@@ -16,13 +16,15 @@ Section: docs/inference.md#calibration-and-geometry
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.linalg import null_space
+from scipy.spatial.transform import Rotation
 
+from failuretwin.connection.registration.poses import Poses
+from failuretwin.connection.student_fit import StudentFit, fit_student
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.geometry import (
     NO_OFFSET,
@@ -30,6 +32,8 @@ from failuretwin.digital_model.geometry import (
     JointCorrection,
     Pose,
     roll_pitch_yaw,
+    seen_chain,
+    with_tool,
 )
 from failuretwin.digital_model.kinematics import Loads, SerialChain, rotation_to_z
 from failuretwin.digital_model.robot import Robot
@@ -249,7 +253,8 @@ class Fitted:
     @property
     def turn(self) -> FloatArray:
         """Turn of the base in the sensor's frame, (3, 3)."""
-        return rotation(self._three(*(f"base {angle}" for angle in ANGLES))) @ self.start.frame.R
+        turn = Rotation.from_rotvec(self._three(*(f"base {angle}" for angle in ANGLES)))
+        return np.asarray(turn.as_matrix() @ self.start.frame.R)
 
     @property
     def origin(self) -> FloatArray:
@@ -279,25 +284,17 @@ class Fitted:
         return np.asarray(unit * (self.arm.lines[j] @ self.values[at])) if at else np.zeros(4)
 
     def _joint_pose(self, j: int) -> FloatArray:
-        joint = self.arm.chain.joints[j]
-        spin = transform(NO_OFFSET, (0.0, 0.0, self.zero(j)))
-        if joint.prismatic:
-            spin = transform((0.0, 0.0, self.zero(j)), NO_OFFSET)
-        return joint.T_pj @ _across(self.moved(j)) @ spin
+        joint, along = self.arm.chain.joints[j], (0.0, 0.0, self.zero(j))
+        own = (along, NO_OFFSET) if joint.prismatic else (NO_OFFSET, along)
+        return joint.T_pj @ _across(self.moved(j)) @ transform(*own)
 
     @cached_property
     def chain(self) -> SerialChain:
         """The chain as the sensor sees it."""
-        base, chain = np.eye(4), self.arm.chain
-        base[:3, :3], base[:3, 3] = self.turn, self.origin
-        joints = []
-        for j, joint in enumerate(chain.joints):
-            T = self._joint_pose(j)
-            T[:3, 3] *= self.scale
-            joints.append(replace(joint, T_pj=base @ T if j == 0 else T))
-        tip = chain.T_jt @ transform(self.tool_xyz, NO_OFFSET)
-        tip[:3, 3] *= self.scale
-        return SerialChain(tuple(joints), tip)
+        joints = enumerate(self.arm.chain.joints)
+        moved = tuple(replace(joint, T_pj=self._joint_pose(j)) for j, joint in joints)
+        whole = with_tool(replace(self.arm.chain, joints=moved), self.tool_xyz)
+        return seen_chain(whole, self.base_xyz_rpy, self.scale)
 
     def expected(self, target: FloatArray, torque: FloatArray) -> FloatArray:
         """Return where the tool should be seen, (pose, 3) [m].
@@ -329,6 +326,42 @@ class Fitted:
         )
 
 
+@dataclass(frozen=True)
+class Posterior:
+    """An arm fitted to poses.
+
+    Attributes:
+        fitted: Its most probable numbers.
+        told: The fit, in units of what was believed before and metres.
+    """
+
+    fitted: Fitted
+    told: StudentFit
+
+
+def fit(
+    arm: Arm, start: Start, unknowns: Unknowns, poses: Poses, begin: FloatArray | None = None
+) -> Posterior:
+    """Return an arm fitted to poses.
+
+    Args:
+        arm: The arm.
+        start: Senses, zeros and frame to start from.
+        unknowns: What is asked.
+        poses: Settled poses.
+        begin: Numbers to begin at, (unknown,); None: 0.
+    """
+    spread, torque = unknowns.spread, arm.torque(poses.target, start)
+
+    def residual(x: FloatArray) -> FloatArray:
+        expected = Fitted(arm, start, unknowns, x * spread).expected(poses.target, torque)
+        return np.asarray(poses.point - expected)
+
+    begin = np.zeros(len(unknowns)) if begin is None else begin
+    told = fit_student(residual, begin / spread, 3)
+    return Posterior(Fitted(arm, start, unknowns, told.value * spread), told)
+
+
 def _triple(values: FloatArray) -> Triple:
     x, y, z = values.tolist()
     return x, y, z
@@ -337,19 +370,6 @@ def _triple(values: FloatArray) -> Triple:
 def _across(moved: FloatArray) -> FloatArray:
     """Return the transform (4, 4) that moves an axis across itself by shift and tilt, (4,)."""
     T = np.eye(4)
-    T[:3, :3] = rotation(np.array([moved[2], moved[3], 0.0]))
+    T[:3, :3] = Rotation.from_rotvec([moved[2], moved[3], 0.0]).as_matrix()
     T[:2, 3] = moved[:2]
     return T
-
-
-_ONE = np.eye(3)
-
-
-def rotation(vector: FloatArray) -> FloatArray:
-    """Return the rotation (3, 3) about a vector by its length [rad] (Rodrigues)."""
-    x, y, z = vector.tolist()
-    angle = math.sqrt(x * x + y * y + z * z)
-    a = 1.0 if angle < 1e-9 else math.sin(angle) / angle
-    b = 0.5 if angle < 1e-9 else (2.0 * math.sin(0.5 * angle) ** 2) / angle**2
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(_ONE + a * K + b * (K @ K))

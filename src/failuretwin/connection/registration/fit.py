@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from failuretwin.connection.calibration.result import Parameter
-from failuretwin.connection.registration.arm import Arm, Fitted
+from failuretwin.connection.registration.arm import Arm, Fitted, Posterior, fit
 from failuretwin.connection.registration.poses import Poses, settled_poses
-from failuretwin.connection.registration.robust import Posterior, fit
 from failuretwin.connection.registration.search import Registered, search
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import check_motors
@@ -109,13 +108,13 @@ def register(poses: Poses, robot: Robot, source: str = "", date: str = "") -> Re
     told = f"failuretwin robot fit{when}: {len(poses)} settled poses"
     told += f" of {source}" if source else ""
     return Registration(
-        profile=_profile(robot, fitted, whole.noise, told),
+        profile=_profile(robot, fitted, whole.told.noise, told),
         parameters=_parameters(whole),
         poses=len(poses),
         before_mm=_middle_mm(poses.point - DigitalTwin(robot).path(poses.target)),
         frames_mm=_middle_mm(_error(found.best, poses)),
         after_mm=_unseen_mm(arm, whole, poses),
-        noise_m=whole.noise,
+        noise_m=whole.told.noise,
         not_told=tuple(_not_told(whole)),
         remarks=tuple(_remarks(robot, found, whole, poses)),
     )
@@ -215,41 +214,26 @@ STEP = 1e-5
 
 def _parameters(found: Posterior) -> tuple[Parameter, ...]:
     """Return the stated numbers with their intervals (delta method)."""
-    slopes, names = _slopes(found.fitted), found.fitted.arm.robot.motor_names
-    deviations = np.sqrt(np.einsum("nu,uv,nv->n", slopes, found.covariance, slopes))
+    slopes = _slopes(found.fitted)
+    deviations = np.sqrt(np.einsum("nu,uv,nv->n", slopes, found.told.covariance, slopes))
     priors = np.linalg.norm(slopes, axis=1)
     rows = []
-    for number, deviation, prior in zip(_stated(found.fitted), deviations, priors, strict=True):
+    for one, deviation, prior in zip(_stated(found.fitted), deviations, priors, strict=True):
         if prior < 1e-9:  # fixed: no unknown moves it
             continue
         learned = bool(deviation < LEARNED * prior)
-        rows.append(
-            Parameter.normal(
-                number.name,
-                "" if number.motor is None else names[number.motor],
-                number.unit,
-                number.value,
-                float(deviation),
-                learned,
-                "" if learned else "the poses do not say; it stays where the URDF puts it",
-            )
-        )
+        note = "" if learned else "the poses do not say; it stays where the URDF puts it"
+        known = one.name, one.motor, one.unit, one.value
+        rows.append(Parameter.normal(*known, float(deviation), learned, note))
     return tuple(rows)
 
 
-@dataclass(frozen=True)
-class _Number:
-    """A number as people read it: a place rather than a change, an axis by shift and tilt."""
+def _stated(fitted: Fitted) -> list[Parameter]:
+    """Return the numbers of an arm as people read them, without their intervals.
 
-    name: str
-    motor: int | None
-    unit: str
-    value: float
-
-
-def _stated(fitted: Fitted) -> list[_Number]:
-    """Return the numbers of an arm, then shift and tilt of each axis in its own frame."""
-    places = iter((*fitted.base_xyz_rpy, *fitted.tool_xyz))
+    Places rather than changes; then shift and tilt of each axis in its own frame.
+    """
+    places, names = iter((*fitted.base_xyz_rpy, *fitted.tool_xyz)), fitted.arm.robot.motor_names
     numbers = []
     for unknown, value in zip(fitted.unknowns, fitted.values.tolist(), strict=True):
         if unknown.name.startswith("axis "):
@@ -259,10 +243,11 @@ def _stated(fitted: Fitted) -> list[_Number]:
             stated = fitted.zero(unknown.motor)
         elif unknown.name == "sensor scale":
             stated = fitted.scale
-        numbers.append(_Number(unknown.name, unknown.motor, unknown.unit, stated))
-    for j in range(fitted.arm.motors):
+        motor = "" if unknown.motor is None else names[unknown.motor]
+        numbers.append(Parameter.normal(unknown.name, motor, unknown.unit, stated, 0.0))
+    for j, motor in enumerate(names):
         axis = zip(AXIS_NUMBERS, fitted.moved(j).tolist(), strict=True)
-        numbers += [_Number(name, j, unit, value) for (name, unit), value in axis]
+        numbers += [Parameter.normal(name, motor, unit, value, 0.0) for (name, unit), value in axis]
     return numbers
 
 
@@ -286,7 +271,7 @@ def _slopes(fitted: Fitted) -> FloatArray:
 
 def _not_told(found: Posterior) -> list[str]:
     """Return the directions whose posterior is as wide as the prior, widest first."""
-    size, ways = np.linalg.eigh(found.covariance)
+    size, ways = np.linalg.eigh(found.told.covariance)
     sentences = []
     for deviation, way in sorted(zip(np.sqrt(size), ways.T, strict=True), key=lambda p: -p[0]):
         if deviation < NOT_TOLD:

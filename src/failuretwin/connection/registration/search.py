@@ -15,9 +15,8 @@ from itertools import combinations, product
 
 import numpy as np
 
-from failuretwin.connection.registration.arm import Arm, Start
+from failuretwin.connection.registration.arm import Arm, Posterior, Start, fit
 from failuretwin.connection.registration.poses import Poses
-from failuretwin.connection.registration.robust import Posterior, fit
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.geometry import with_tool
 from failuretwin.inference.set_ups.registration import Frame, align
@@ -71,11 +70,11 @@ def search(arm: Arm, poses: Poses) -> Registered:
     found = _fitted(arm, ranked[:FINER], few)
     best = max(found, key=lambda one: _score(arm, one))
     found += [_registered(arm, one, few) for one in _one_turned(arm, few, best)]
-    found.sort(key=lambda one: one.log_likelihood)
+    found.sort(key=lambda one: one.told.log_likelihood)
     known = {tuple(one.fitted.start.sense.tolist()): one for one in found}
     order = sorted(known.values(), key=lambda one: -_score(arm, one))
     top = order[0]
-    ties = [f for f in order[1:] if f.log_likelihood > top.log_likelihood - SURE_NATS]
+    ties = [f for f in order[1:] if f.told.log_likelihood > top.told.log_likelihood - SURE_NATS]
     return Registered(_registered(arm, _as_start(top), poses), tuple(ties))
 
 
@@ -91,13 +90,13 @@ def _score(arm: Arm, found: Posterior) -> float:
     own = arm.robot.sensor_sense
     turned = int(np.sum(found.fitted.start.sense != own))
     upright = found.fitted.turn[2, 2] > 0.0
-    return found.log_likelihood - TURN_NATS * turned + TURN_NATS * upright
+    return found.told.log_likelihood - TURN_NATS * turned + TURN_NATS * upright
 
 
 def _as_start(found: Posterior) -> Start:
     fitted = found.fitted
     zero = np.array([fitted.zero(j) for j in range(fitted.arm.motors)])
-    return Start(fitted.start.sense, zero, Frame(fitted.turn, fitted.origin, found.sigma))
+    return Start(fitted.start.sense, zero, Frame(fitted.turn, fitted.origin, found.told.sigma))
 
 
 def _registered(arm: Arm, start: Start, poses: Poses) -> Posterior:

@@ -1,0 +1,125 @@
+"""The most probable unknowns of a model whose residuals scatter as a Student t.
+
+    log p(x | rows) = sum_i log t_4(r_i(x); sigma^2 I) - 1/2 |x|^2
+
+in units of what was believed before. A row that is far off, such as a pose that lost a command,
+counts for little; sigma is fitted too. The covariance is that of an M-estimator: with the weight
+w = (4 + n) / (4 + d) of a row in n dimensions at the squared distance d = |r|^2 / sigma^2,
+
+    A = mean w (1 - 2 d / (n (4 + d))),   B = mean w^2 |r|^2 / n,   C = (J^T J A^2 / B + I)^-1
+
+Section: docs/inference.md#calibration-and-geometry
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from failuretwin.core.numerics import log_student
+from failuretwin.core.types import FloatArray, as_floats
+
+DOF = 4.0
+"""Degrees of freedom of the scatter, as of healthy readings."""
+LEAST_SIGMA = 1e-6
+"""Scatter below that of any sensor: exact readings, as of a twin."""
+SIGMA_ROUNDS = 6
+"""Rounds in which scatter and unknowns settle together; each starts where the last one ended."""
+SETTLED = 0.02
+"""Relative change of the scatter that ends them."""
+
+Residual = Callable[[FloatArray], FloatArray]
+"""Residuals (row, n) by the unknowns (unknown,) in units of what was believed before."""
+
+
+@dataclass(frozen=True)
+class StudentFit:
+    """Unknowns fitted to rows.
+
+    Attributes:
+        value: The most probable unknowns, in units of what was believed before, (unknown,).
+        covariance: Of the same, (unknown, unknown).
+        sigma: Scatter of rows on each axis, robustly.
+        noise: Standard deviation that stands for what rows scatter; see the module.
+        log_likelihood: Of the rows at the mode, for comparing starts.
+    """
+
+    value: FloatArray
+    covariance: FloatArray
+    sigma: float
+    noise: float
+    log_likelihood: float
+
+
+def fit_student(residual: Residual, begin: FloatArray, dims: int) -> StudentFit:
+    """Return the unknowns fitted to rows.
+
+    Args:
+        residual: The model.
+        begin: Unknowns to begin at, (unknown,).
+        dims: n, the dimensions in which residuals can differ; channels may be more.
+    """
+    x, scatter = begin, _Scatter(dims)
+    sigma = scatter.sigma(residual(x), np.inf)
+    for _ in range(SIGMA_ROUNDS):
+        x = scatter.mode(residual, x, sigma)
+        before, sigma = sigma, scatter.sigma(residual(x), sigma)
+        if abs(sigma - before) < SETTLED * sigma:
+            break
+    r, J = residual(x), _jacobian(residual, x)
+    freedom = float(dims * len(r))
+    size = np.linalg.svd(J / sigma, compute_uv=False) ** 2
+    lost = min(float(np.sum(size / (1.0 + size))), 0.9 * freedom)  # told by rows, not by the prior
+    noise = scatter.effective(r, sigma) * float(np.sqrt(freedom / (freedom - lost)))
+    covariance = as_floats(np.linalg.inv(J.T @ J / noise**2 + np.eye(len(x))))
+    density = log_student(r, np.zeros((*r.shape, 1)), sigma**2, DOF)
+    return StudentFit(x, covariance, sigma, noise, float(density.sum()))
+
+
+@dataclass(frozen=True)
+class _Scatter:
+    """The Student t of residuals in some dimensions."""
+
+    dims: int
+
+    def mode(self, residual: Residual, x: FloatArray, sigma: float) -> FloatArray:
+        """Return the mode: the log density of a row as a square, with the prior beside it."""
+
+        def terms(x: FloatArray) -> FloatArray:
+            r = residual(x)
+            square = np.maximum(np.einsum("ia,ia->i", r, r) / sigma**2, 1e-30)
+            shrunk = np.sqrt((DOF + self.dims) * np.log1p(square / DOF) / square) / sigma
+            return np.concatenate([(r * shrunk[:, None]).ravel(), x])
+
+        return np.asarray(least_squares(terms, x, method="lm", max_nfev=40 * (len(x) + 1)).x)
+
+    def sigma(self, r: FloatArray, sigma: float) -> float:
+        """Return the scatter at which its likelihood is greatest, from that before."""
+        square = np.einsum("ia,ia->i", r, r)
+        if np.isinf(sigma):
+            sigma = float(np.sqrt(np.median(square) / chi2.median(self.dims)))
+        for _ in range(30):
+            sigma = max(sigma, LEAST_SIGMA)
+            weight = (DOF + self.dims) / (DOF + square / sigma**2)
+            sigma = float(np.sqrt(np.mean(weight * square) / self.dims))
+        return max(sigma, LEAST_SIGMA)
+
+    def effective(self, r: FloatArray, sigma: float) -> float:
+        """Return B^1/2 / A."""
+        square = np.einsum("ia,ia->i", r, r)
+        d = square / sigma**2
+        weight = (DOF + self.dims) / (DOF + d)
+        slope = float(np.mean(weight * (1.0 - 2.0 * d / (self.dims * (DOF + d)))))
+        middle = float(np.sqrt(np.mean(weight**2 * square) / self.dims))
+        return max(middle / slope, LEAST_SIGMA)
+
+
+def _jacobian(residual: Residual, x: FloatArray) -> FloatArray:
+    """Return derivatives of the residuals by central differences, (n row, unknown)."""
+    steps = 1e-4 * np.eye(len(x))
+    columns = [(residual(x + step) - residual(x - step)).ravel() / 2e-4 for step in steps]
+    return np.stack(columns, axis=1)
