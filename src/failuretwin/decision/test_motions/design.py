@@ -21,7 +21,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.safety import SafetyGate, Way
 from failuretwin.decision.acting.work import QUIET_S
-from failuretwin.decision.test_motions.outlook import Asked, Outlook, of_posterior
+from failuretwin.decision.test_motions.outlook import Outlook, of_posterior
 from failuretwin.inference.observation.evidence import SETTLING_S
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
@@ -138,12 +138,14 @@ class Designer:
         told = np.array([start, *(movement.order.target for movement in made)])
         since = np.cumsum([0.0, *(movement.seconds for movement in made)])
         outlook = self.outlook.after(told)
-        before = Asked.of(told, since[1:])
-        nats = outlook.distances(before).sum(axis=0)
+        made_so_far = told[1:], told[:-1], since[1:], np.arange(len(made))
+        nats = outlook.distances(*made_so_far).sum(axis=0)
 
         def score_of(poses: FloatArray) -> FloatArray:
-            asked = Asked.one_of(poses, before, told[-1], float(since[-1]))
-            gained = outlook.information(nats + outlook.distances(asked))
+            count = len(poses)
+            before = np.tile(told[-1], (count, 1)), np.full(count, since[-1])
+            next_nats = outlook.distances(poses, *before, np.full(count, len(made)))
+            gained = outlook.information(nats + next_nats)
             needed = np.array([self.gate.least_duration(pose - told[-1]) for pose in poses])
             return np.asarray((gained - outlook.information(nats)) / (needed + self.rest_s))
 
