@@ -31,7 +31,6 @@ from failuretwin.decision.learned.feature_encoder import (
 from failuretwin.decision.learned.log_pool import PoolWeights
 from failuretwin.decision.learned.networks import (
     Batch,
-    Pace,
     Shape,
     Standard,
     build_network,
@@ -146,9 +145,9 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             network = build_network(
                 self.network, network_shape(self.encoder, len(standard.mean), len(classes))
             )
-            pace = Pace(self.iterations, self.learning_rate, self.decay)
             standardised = ((standard(features), index) for features, index in batches)
-            for done in training(network, standardised, pace):
+            how = self.iterations, self.learning_rate, self.decay
+            for done in training(network, standardised, *how):
                 on_iteration(done)
         self.network_ = network.cpu()
         self.classes_, self.standard_, self.temperature_ = classes, standard, 1.0
