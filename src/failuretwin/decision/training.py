@@ -6,7 +6,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import count
 from typing import TYPE_CHECKING, Any
 
@@ -89,7 +89,6 @@ class TrainingData:
         variants: Kinds of runs, equally frequent.
         engine: Simulation engine; see `Plan`.
         hypotheses: The classes; empty: the paper's.
-        modes: Fault modes by id; variants override magnitude and onset of the paper's modes.
     """
 
     robot: Robot
@@ -98,7 +97,6 @@ class TrainingData:
     variants: tuple[Variant, ...] = VARIANTS
     engine: str = "servo"
     hypotheses: tuple[Hypothesis, ...] = ()
-    modes: Mapping[str, FaultMode] = field(default_factory=lambda: dict(MODES))
 
     def __post_init__(self) -> None:
         if not self.hypotheses:
@@ -147,7 +145,7 @@ class TrainingData:
             seed=self.seed,
             imperfections=self.imperfections,
             movements=RandomMovements(),
-            modes={**self.modes, **_modes_of(variant)},
+            modes={**MODES, **_modes_of(variant)},
             engine=self.engine,
         )
 

@@ -19,7 +19,7 @@ import numpy as np
 from failuretwin.connection.links.base import Order
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.safety import SafetyGate, Way
+from failuretwin.decision.acting.safety import LEAST_RAMP_S, SafetyGate, Way
 from failuretwin.decision.acting.work import QUIET_S
 from failuretwin.decision.test_motions.outlook import Outlook, of_posterior
 from failuretwin.inference.observation.evidence import SETTLING_S
@@ -173,7 +173,7 @@ class Designer:
                 continue
             made.append(found)
             left, at = left - found.seconds, found.order.target
-            if len(made) == most or left < self.rest_s + self.gate.limits.least_ramp_s:
+            if len(made) == most or left < self.rest_s + LEAST_RAMP_S:
                 break
         return made
 
@@ -215,22 +215,20 @@ def next_movement(
     posterior: Posterior,
     at: FloatArray,
     seed: int = 0,
-    row: int = 0,
 ) -> Order | None:
     """Return the movement that is expected to settle best what a posterior leaves open.
 
     Args:
         model: The healthy robot.
         gate: What is safe.
-        posterior: Of one arm, or of several.
+        posterior: Of one run.
         at: What its motors were told last, (motor,) [rad].
         seed: Seed of the poses that are tried.
-        row: Which arm.
 
     Returns:
         The order; None: none is safe, or nothing is left to ask.
     """
-    members = of_posterior(posterior, row)
+    members = of_posterior(posterior)
     if len({member.hypothesis for member in members}) < 2:
         return None
     found = Designer(gate, Outlook(model, members), seed).next(at)

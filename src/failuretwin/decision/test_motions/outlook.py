@@ -97,13 +97,13 @@ def _prior_sizes(model: HealthyModel, hypothesis: Hypothesis, priors: Priors) ->
     return [*(-sizes if mode.signed else []), *sizes]
 
 
-def of_posterior(posterior: Posterior, row: int) -> list[Member]:
-    """Return members of what is left after some movements, sizes at quantiles of what they say."""
-    shares = np.exp(posterior.log_posterior[row])
+def of_posterior(posterior: Posterior) -> list[Member]:
+    """Return members of what is left of one run, sizes at quantiles of what it says."""
+    shares = np.exp(posterior.log_posterior[0])
 
     def size_of(at: int) -> Weighted | None:
         healthy = posterior.hypotheses[at].is_healthy
-        return None if healthy else posterior.weights[at].estimate(row).size
+        return None if healthy else posterior.weights[at].estimate(0).size
 
     return _at_quantiles(posterior.hypotheses, shares, size_of)
 
