@@ -6,7 +6,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import TYPE_CHECKING, Any
 
@@ -89,6 +89,8 @@ class TrainingData:
         variants: Kinds of runs, equally frequent.
         engine: Simulation engine; see `Plan`.
         hypotheses: The classes; empty: the paper's.
+        modes: Fault modes by id, which other processes would not have registered; variants
+            override magnitude and onset of the paper's modes.
     """
 
     robot: Robot
@@ -97,6 +99,7 @@ class TrainingData:
     variants: tuple[Variant, ...] = VARIANTS
     engine: str = "servo"
     hypotheses: tuple[Hypothesis, ...] = ()
+    modes: Mapping[str, FaultMode] = field(default_factory=lambda: dict(MODES))
 
     def __post_init__(self) -> None:
         if not self.hypotheses:
@@ -145,7 +148,7 @@ class TrainingData:
             seed=self.seed,
             imperfections=self.imperfections,
             movements=RandomMovements(),
-            modes={**MODES, **_modes_of(variant)},
+            modes={**self.modes, **_modes_of(variant)},
             engine=self.engine,
         )
 
