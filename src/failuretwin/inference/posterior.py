@@ -296,6 +296,8 @@ class Posterior:
         offsets: The same of zeros that are far off what such robots do.
         explained: Log density of each settled position given all before it, (run, movement), where
             more is known than the runs say; None: what the best hypothesis makes of it counts.
+        log_settled: Log of the sum over hypotheses of p(h) p(settled positions | h), (run,); None:
+            it was not asked for.
         no_verdict: Why no set-up allows a verdict on each run; empty: nothing keeps from any.
     """
 
@@ -307,7 +309,14 @@ class Posterior:
     set_up: Sequence[str] = ()
     offsets: Sequence[str] = ()
     explained: FloatArray | None = None
+    log_settled: FloatArray | None = None
     no_verdict: Sequence[str] = ()
+
+    @property
+    def settled_evidence(self) -> FloatArray:
+        """Log density of the settled positions of each run, over all hypotheses, (run,)."""
+        assert self.log_settled is not None, "this posterior was made without settled evidence"
+        return self.log_settled
 
     def undecided(self, run: int, quality: LogQuality) -> str:
         """Return why a run allows no verdict, empty if it does.
@@ -430,11 +439,23 @@ def compute_posterior(
         hypotheses: What may be the case.
         priors: Beliefs about onset and size.
     """
-    weights = marginal_likelihoods(likelihood, hypotheses, priors)
+    weights = settled = marginal_likelihoods(likelihood, hypotheses, priors)
+    if likelihood.moving is not None:
+        settled = marginal_likelihoods(replace(likelihood, moving=None), hypotheses, priors)
     prior = log_prior(hypotheses, priors)
-    log_joint = np.stack([weight.log_evidence for weight in weights], axis=1) + prior
+    log_joint, log_settled = (
+        np.stack([weight.log_evidence for weight in said], axis=1) + prior
+        for said in (weights, settled)
+    )
     log_posterior = log_joint - log_sum(log_joint, axis=1)[:, None]
-    return Posterior(likelihood, hypotheses, prior, log_posterior, weights)
+    return Posterior(
+        likelihood,
+        hypotheses,
+        prior,
+        log_posterior,
+        weights,
+        log_settled=log_sum(log_settled, axis=1),
+    )
 
 
 def _with_estimate(

@@ -102,22 +102,16 @@ class RobotPosterior:
         component: The component.
         rows: Indices of the runs.
         posterior: Of these runs.
-        settled: Log of w_c sum over h of p(h) p(run | h, c) by settled positions, (row,).
     """
 
     component: RobotComponent
     rows: IntArray
     posterior: Posterior
-    settled: FloatArray
 
-    @classmethod
-    def of(
-        cls, component: RobotComponent, rows: IntArray, posterior: Posterior, settled: Posterior
-    ) -> RobotPosterior:
-        """Return it from the posterior of all readings, and that of settled positions alone."""
-        evidence = np.stack([one.log_evidence for one in settled.weights], axis=1)
-        says = log_sum(evidence + settled.log_prior, axis=1)
-        return cls(component, rows, posterior, component.log_weight + says)
+    @property
+    def settled(self) -> FloatArray:
+        """Log of w_c sum over h of p(h) p(run | h, c) by settled positions, (row,)."""
+        return self.component.log_weight + self.posterior.settled_evidence
 
     @property
     def told(self) -> str:
@@ -158,18 +152,14 @@ class RobotMixture:
         """
         first, *others = components
         alone = replace(named.likelihood, moving=None)
-        settled, rows = named, np.arange(len(named.log_posterior))
-        if others and named.likelihood.moving is not None:
-            settled = shared_posterior(alone, named.hypotheses, priors, in_doubt)
-        mixture = cls([RobotPosterior.of(first, rows, named, settled)], common)
+        mixture = cls([RobotPosterior(first, np.arange(len(named.log_posterior)), named)], common)
         for one in others:
             likelihood = RunLikelihood(alone.evidence, one.model)
             some = mixture.rows_to_weigh(one, likelihood, priors)
             if len(some):
                 doubt = in_doubt and one is others[0]
                 says = shared_posterior(likelihood[some], named.hypotheses, priors, doubt)
-                part = RobotPosterior.of(one, some, says, says)
-                mixture = cls([*mixture.parts, part], common)
+                mixture = cls([*mixture.parts, RobotPosterior(one, some, says)], common)
         return mixture
 
     @cached_property

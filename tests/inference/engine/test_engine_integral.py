@@ -9,10 +9,10 @@ from failuretwin.inference.engine.integral import (
     FURTHEST,
     Mixture,
     Noise,
-    inverse,
     moment_posterior,
     scale_mixture,
 )
+from failuretwin.inference.engine.symmetric import inverse, packed, times, unpacked
 
 COUNT = 400_000
 
@@ -40,18 +40,23 @@ def moment(rng, outcomes=4, spread=1.0):
     residual = rng.normal(scale=4e-3, size=(outcomes, 3))
     weight = np.log(rng.dirichlet(np.ones(outcomes)))
     root = rng.normal(size=(3, 3)) * 2e-3 * spread
-    return Mixture(residual[None], scale[None], weight[None]), root @ root.T
+    return residual, scale, weight, root @ root.T
+
+
+def says(residual, scale, log_weight, mean, covariance, noise):
+    """What the moment says of its one row."""
+    mixture = Mixture(residual.T[..., None], packed(scale)[..., None], log_weight[:, None])
+    return moment_posterior(mixture, mean[:, None], packed(covariance)[:, None], noise)
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_evidence_mean_and_covariance_are_those_of_many_draws(seed):
     rng = np.random.default_rng(seed)
-    mixture, covariance = moment(rng, spread=[0.2, 1.0, 4.0][seed % 3])
+    *parts, covariance = moment(rng, spread=[0.2, 1.0, 4.0][seed % 3])
     mean = rng.normal(scale=1e-3, size=3)
     noise = Noise(dof=5.0, dims=3, log_outlier=-2.5)
-    found = moment_posterior(mixture, mean[None], covariance[None], noise)
+    found = says(*parts, mean, covariance, noise)
     f = rng.multivariate_normal(mean, covariance, size=COUNT)
-    parts = mixture.residual[0], mixture.scale[0], mixture.log_weight[0]
     terms = [
         w + stats.multivariate_t(r, S, noise.dof).logpdf(f) for r, S, w in zip(*parts, strict=True)
     ]
@@ -61,19 +66,18 @@ def test_evidence_mean_and_covariance_are_those_of_many_draws(seed):
     assert found.log_evidence[0] == pytest.approx(logsumexp(weight) - np.log(COUNT), abs=0.06)
     centre = share @ f
     spread = (f - centre).T @ ((f - centre) * share[:, None])
-    told = mean + covariance @ found.alpha[0]
+    told = mean + covariance @ found.alpha[:, 0]
     deviation = np.sqrt(np.diag(spread))
     assert np.abs(told - centre).max() < (0.1 + 4.0 / np.sqrt(effective)) * deviation.max()
-    after = covariance - covariance @ found.curvature[0] @ covariance
+    after = covariance - covariance @ unpacked(found.curvature)[0] @ covariance
     assert np.sqrt(np.diag(after)) == pytest.approx(deviation, rel=0.15)
 
 
 def test_without_doubt_the_evidence_is_the_density_of_the_mixture():
     rng = np.random.default_rng(1)
-    mixture, _ = moment(rng, outcomes=20)
+    *parts, _ = moment(rng, outcomes=20)
     noise = Noise(dof=4.0, dims=3, log_outlier=-2.5)
-    found = moment_posterior(mixture, np.zeros((1, 3)), np.zeros((1, 3, 3)), noise)
-    parts = mixture.residual[0], mixture.scale[0], mixture.log_weight[0]
+    found = says(*parts, np.zeros(3), np.zeros((3, 3)), noise)
     terms = [
         w + stats.multivariate_t(np.zeros(3), S, noise.dof).logpdf(r)
         for r, S, w in zip(*parts, strict=True)
@@ -81,16 +85,13 @@ def test_without_doubt_the_evidence_is_the_density_of_the_mixture():
     exact = logsumexp([*terms, noise.log_outlier])
     assert found.log_evidence[0] == pytest.approx(exact, abs=0.06)
     shares = np.exp(np.array(terms) - exact)
-    assert found.share[0] == pytest.approx(shares, abs=0.02)
+    assert found.share[:, 0] == pytest.approx(shares, abs=0.02)
 
 
 def test_a_tool_anywhere_says_nothing():
-    residual, scale = np.full((1, 1, 3), 5.0), 1e-6 * np.eye(3)[None, None]
+    residual, scale = np.full((1, 3), 5.0), 1e-6 * np.eye(3)[None]
     noise = Noise(dof=5.0, dims=3, log_outlier=-2.5)
-    covariance = 1e-4 * np.eye(3)[None]
-    found = moment_posterior(
-        Mixture(residual, scale, np.zeros((1, 1))), np.zeros((1, 3)), covariance, noise
-    )
+    found = says(residual, scale, np.zeros(1), np.zeros(3), 1e-4 * np.eye(3), noise)
     assert found.log_evidence[0] == pytest.approx(-2.5, abs=1e-6)
     assert np.abs(found.alpha * 1e-2).max() < 1e-4
     assert found.share[0, 0] < 1e-6
@@ -101,6 +102,10 @@ def test_inverse_of_symmetric_matrices(size):
     rng = np.random.default_rng(size)
     root = rng.normal(size=(7, size, size))
     matrix = root @ np.swapaxes(root, -1, -2) + 0.1 * np.eye(size)
-    found, log_determinant = inverse(matrix)
-    assert found @ matrix == pytest.approx(np.broadcast_to(np.eye(size), matrix.shape), abs=1e-8)
+    found, log_determinant = inverse(packed(matrix))
+    identity = np.broadcast_to(np.eye(size), matrix.shape)
+    assert unpacked(found) @ matrix == pytest.approx(identity, abs=1e-8)
     assert log_determinant == pytest.approx(np.linalg.slogdet(matrix)[1])
+    vector = rng.normal(size=(7, size))
+    moved = np.einsum("nij,nj->in", matrix, vector)
+    assert times(packed(matrix), vector.T) == pytest.approx(moved)

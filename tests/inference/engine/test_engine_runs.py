@@ -16,9 +16,8 @@ from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.geometry import Geometry, JointCorrection
 from failuretwin.digital_model.robot import _assembled, load_robot
 from failuretwin.inference.engine.filter import filter_rows, refine
-from failuretwin.inference.engine.integral import inverse
 from failuretwin.inference.engine.moments import moments_of
-from failuretwin.inference.engine.picks import Part, Picks
+from failuretwin.inference.engine.picks import Part, Picks, prepared
 from failuretwin.inference.engine.posterior import marginal_likelihoods, theta_posterior
 from failuretwin.inference.engine.registration import robot_posterior
 from failuretwin.inference.engine.rows import Scene
@@ -70,10 +69,11 @@ def sampled_evidence(part, found, row, rng):
     K = ready.spread[row][np.ix_(some, some)]
     K += 1e-9 * np.trace(K) / len(K) * np.eye(len(K))
     W = np.zeros((mean[row].size,) * 2)
-    for m, one in enumerate(found.information[row]):
+    information, shifts = found.sites
+    for m, one in enumerate(information[row]):
         W[m * channels : (m + 1) * channels, m * channels : (m + 1) * channels] = one
     precision = np.linalg.inv(K) + W[np.ix_(some, some)]
-    prior_mean, shift = mean[row].ravel()[some], found.shift[row].ravel()[some]
+    prior_mean, shift = mean[row].ravel()[some], shifts[row].ravel()[some]
     C = np.linalg.inv(precision)
     centre = C @ (shift + np.linalg.solve(K, prior_mean))
     root, dof, size = np.linalg.cholesky(0.5 * (C + C.T)), 6.0, len(some)
@@ -90,10 +90,11 @@ def sampled_evidence(part, found, row, rng):
     total = log_p - log_q
     for m in np.flatnonzero(usable[row]):
         mixture = mixture_at(int(m))
-        precision, determinant = inverse(mixture.scale[row])
-        error = mixture.residual[row] - whole[:, None, m * channels : (m + 1) * channels]
+        residual, scale = (values[row] for values in mixture.by_row)
+        precision, determinant = np.linalg.inv(scale), np.linalg.slogdet(scale)[1]
+        error = residual - whole[:, None, m * channels : (m + 1) * channels]
         square = np.einsum("nai,aij,naj->na", error, precision, error)
-        terms = mixture.log_weight[row] + noise.log_density(square, determinant)
+        terms = mixture.log_weight[:, row] + noise.log_density(square, determinant)
         total += np.logaddexp(logsumexp(terms, axis=1), noise.log_outlier)
     weight = np.exp(total - total.max())
     deviation = weight.std() / weight.mean() / np.sqrt(DRAWS)
@@ -109,8 +110,8 @@ def test_evidence_of_likely_rows_is_that_of_importance_sampling(uncalibrated):
         mine = np.flatnonzero((one.picks.run == run) & (one.picks.component == 0))
         row = int(one.picks.row[mine[one.log_evidence[mine].argmax()]])
         picks = Picks(np.array([run]), np.array([row]), np.array([0]))
-        G = rows.columns[picks.run, picks.row_of(rows.columns)]
-        part = Part(uncalibrated.scene, rows, picks, uncalibrated.components, G, G[:, :, :1])
+        components = uncalibrated.components
+        part = Part(uncalibrated.scene, rows, picks, components, prepared(rows, components))
         found = refine(part.filter_rows, filter_rows(part.filter_rows))
         exact, deviation = sampled_evidence(part, found, 0, rng)
         if deviation < 0.05:  # else sampling itself does not tell

@@ -20,9 +20,10 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.settling import sag
 from failuretwin.failure_behavior.fault import Arrival
 from failuretwin.failure_behavior.mode import FaultMode, Signature
-from failuretwin.inference.engine.integral import inverse
+from failuretwin.inference.engine import symmetric
 from failuretwin.inference.engine.outcomes import Outcomes
 from failuretwin.inference.engine.rows import AmountPrior, Rows, Scene, before_onset, sampled
+from failuretwin.inference.engine.symmetric import packed, unpacked
 from failuretwin.inference.engine.theta import columns
 from failuretwin.inference.faults.fault_sizes import SizePrior, coarse_sizes
 from failuretwin.inference.faults.priors import OnsetIntervals, plateau_or_ramp
@@ -88,8 +89,11 @@ class _Motor:
         variance = np.broadcast_to(self.variance, jacobian[..., 0, :].shape).copy()
         variance[..., self.motor] += step**2 / 6.0
         scale = np.matmul(jacobian * variance[..., None, :], np.swapaxes(jacobian, -1, -2))
-        precision, log_determinant = inverse(scale + self._doubt[:, None, :, None])
-        square = np.einsum("brmni,brmnij,brmnj->brmn", error, precision, error)
+        precision, log_determinant = symmetric.inverse(
+            packed(scale + self._doubt[:, None, :, None])
+        )
+        error = np.moveaxis(error, -1, 0)
+        square = symmetric.dot(error, symmetric.times(precision, error))
         says = np.logaddexp(
             scene.noise.log_density(square, log_determinant), scene.noise.log_outlier
         )
@@ -106,7 +110,7 @@ class _Motor:
             error, jacobian, _ = self._residual(angle)
             error, jacobian = error[:, :, :, 0], jacobian[:, :, :, 0]
             scale = np.matmul(jacobian * self.variance, np.swapaxes(jacobian, -1, -2))
-            precision, _ = inverse(scale + self._doubt[:, None])
+            precision = unpacked(symmetric.inverse(packed(scale + self._doubt[:, None]))[0])
             lever = jacobian[..., self.motor] * slope[..., None]
             pull = np.einsum("brmij,brmj->brmi", precision, error)
             square = np.einsum("brmi,brmi->brm", error, pull)

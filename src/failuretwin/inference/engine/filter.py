@@ -17,17 +17,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 
 from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.engine.integral import (
-    Mixture,
-    MomentPosterior,
-    Noise,
-    moment_posterior,
-)
+from failuretwin.inference.engine.integral import Mixture, Noise, moment_posterior
+from failuretwin.inference.engine.symmetric import packed, unpacked
 
 
 @dataclass(frozen=True)
@@ -40,8 +37,8 @@ class FilterRows:
         kept: Probability that the outcome of the moment before holds on, (row, moment).
         mean: G mu, (row, moment, channel) [m].
         covariance: G V G^T, (row, moment * channel, moment * channel) [m2].
-        lever: H, (row, moment, channel).
-        variance: var(z), (row,); 0 without an amount.
+        lever: H, (row, moment, channel, amount).
+        variance: Of each amount, (row, amount).
         noise: The Student t of residuals.
     """
 
@@ -58,19 +55,26 @@ class FilterRows:
     def prior(self) -> tuple[FloatArray, FloatArray]:
         """Mean (row, number) and covariance (row, number, number) of f and, last, z."""
         rows, moments, channels = self.mean.shape
-        size, variance = moments * channels, self.variance[:, None]
-        flat = self.lever.reshape(rows, size)
-        whole = np.zeros((rows, size + 1, size + 1))
+        size, amounts = moments * channels, self.variance.shape[1]
+        crossed = self._flat_lever * self.variance[:, None]
+        whole = np.zeros((rows, size + amounts, size + amounts))
         whole[:, :size, :size] = self.spread
-        whole[:, :size, size] = whole[:, size, :size] = variance * flat
-        whole[:, size, size] = self.variance
-        return np.concatenate([self.mean.reshape(rows, size), np.zeros((rows, 1))], axis=1), whole
+        whole[:, :size, size:] = crossed
+        whole[:, size:, :size] = np.swapaxes(crossed, 1, 2)
+        whole[:, range(size, size + amounts), range(size, size + amounts)] = self.variance
+        mean = self.mean.reshape(rows, size)
+        return np.concatenate([mean, np.zeros((rows, amounts))], axis=1), whole
 
     @property
     def spread(self) -> FloatArray:
         """K, (row, moment * channel, moment * channel) [m2]."""
-        flat = self.lever.reshape(self.covariance.shape[:2])
-        return self.covariance + self.variance[:, None, None] * flat[:, :, None] * flat[:, None]
+        flat = self._flat_lever
+        return self.covariance + (flat * self.variance[:, None]) @ np.swapaxes(flat, 1, 2)
+
+    @property
+    def _flat_lever(self) -> FloatArray:
+        rows, moments, channels, amounts = self.lever.shape
+        return self.lever.reshape(rows, moments * channels, amounts)
 
 
 @dataclass(frozen=True)
@@ -79,26 +83,37 @@ class RowsPosterior:
 
     Attributes:
         log_evidence: Log density of each moment given those before it, (row, moment).
-        information: W, (row, moment, channel, channel).
-        shift: b, (row, moment, channel).
+        alpha: What the integral of each moment says, (row, moment, channel).
+        curvature: B, (row, moment, channel, channel).
+        ahead: Mean of f without the moment, (row, moment, channel) [m].
+        doubt: Covariance of f without the moment, (row, moment, channel, channel) [m2].
         share: Share of each outcome when its moment came, (row, moment, outcome).
         log_weight: Log of its weight before that, (row, moment, outcome).
         mean: Mean of f given all moments, (row, moment, channel) [m].
-        amount: Mean and variance of z given all moments, (row, 2).
+        amount: Mean of z given all moments, (row, amount).
+        amount_spread: Its covariance, (row, amount, amount).
     """
 
     log_evidence: FloatArray
-    information: FloatArray
-    shift: FloatArray
+    alpha: FloatArray
+    curvature: FloatArray
+    ahead: FloatArray
+    doubt: FloatArray
     share: FloatArray
     log_weight: FloatArray
     mean: FloatArray
     amount: FloatArray
+    amount_spread: FloatArray
 
     @property
     def total(self) -> FloatArray:
         """Log density of all moments, (row,)."""
         return np.asarray(self.log_evidence.sum(axis=1))
+
+    @cached_property
+    def sites(self) -> tuple[FloatArray, FloatArray]:
+        """W and b of the normal factor that stands for each moment, as `site` returns them."""
+        return site(self.alpha, self.curvature, self.ahead, self.doubt)
 
     def __getitem__(self, rows: IntArray | slice) -> RowsPosterior:
         """Return some of the rows."""
@@ -125,8 +140,8 @@ def filter_rows(rows: FilterRows) -> RowsPosterior:
     size, usable = moments * channels, rows.usable
     f, whole = rows.prior
     log_evidence = np.zeros((count, moments))
-    information = np.zeros((count, moments, channels, channels))
-    shift = np.zeros((count, moments, channels))
+    alpha, ahead = np.zeros((2, count, moments, channels))
+    curvature, doubt = np.zeros((2, count, moments, channels, channels))
     shares, weights = list[FloatArray](), list[FloatArray]()
     for m in range(moments):
         mixture = rows.mixture_at(m)
@@ -139,26 +154,33 @@ def filter_rows(rows: FilterRows) -> RowsPosterior:
         if len(some):
             at = slice(m * channels, (m + 1) * channels)
             here, spread = f[some, at], whole[some, at, at]
-            found = moment_posterior(mixture[some], here, spread, rows.noise)
-            log_evidence[some, m], share[some] = found.log_evidence, found.share
-            information[some, m], shift[some, m] = site(found, here, spread)
+            found = moment_posterior(mixture[some], here.T, packed(spread), rows.noise)
+            pull, B = found.alpha.T, unpacked(found.curvature)
+            log_evidence[some, m], share[:, some] = found.log_evidence, found.share
+            alpha[some, m], curvature[some, m], ahead[some, m], doubt[some, m] = (
+                pull,
+                B,
+                here,
+                spread,
+            )
             cross = whole[some, :, at]
-            f[some] += np.matmul(cross, found.alpha[..., None])[..., 0]
-            W = information[some, m]
-            taken = np.linalg.solve(np.eye(channels) + W @ spread, W)
-            whole[some] -= np.matmul(np.matmul(cross, taken), np.swapaxes(cross, -1, -2))
+            f[some] += np.matmul(cross, pull[..., None])[..., 0]
+            whole[some] -= np.matmul(np.matmul(cross, B), np.swapaxes(cross, -1, -2))
         if m:  # a moment that was not seen leaves what was known of its movement
             unseen = (rows.kept[:, m] > 0.0) & ~usable[:, m]
-            share = np.where(unseen[:, None], shares[-1], share)
+            share = np.where(unseen, shares[-1], share)
         shares.append(share)
     return RowsPosterior(
         log_evidence,
-        information,
-        shift,
-        np.stack(shares, axis=1),
-        np.stack(weights, axis=1),
+        alpha,
+        curvature,
+        ahead,
+        doubt,
+        np.moveaxis(np.stack(shares), -1, 0),
+        np.moveaxis(np.stack(weights), -1, 0),
         f[:, :size].reshape(count, moments, channels),
-        np.stack([f[:, size], whole[:, size, size]], axis=1),
+        f[:, size:],
+        whole[:, size:, size:],
     )
 
 
@@ -170,38 +192,41 @@ def _carried(
     What an outlier leaves open is as it was before.
 
     Args:
-        log_weight: Weights that nothing is known of, (row, outcome).
-        share: Share of each when the moment before came, (row, outcome).
-        before: Log of its weight then, (row, outcome).
+        log_weight: Weights that nothing is known of, (outcome, row).
+        share: Share of each when the moment before came, (outcome, row).
+        before: Log of its weight then, (outcome, row).
         kept: Probability that it holds on, (row,).
     """
     found = log_weight.copy()
-    some = np.flatnonzero((kept > 0.0) & np.isfinite(before).any(axis=1))
-    total, stays = log_sum(log_weight[some], axis=1)[:, None], kept[some, None]
-    usual = np.exp(before[some] - log_sum(before[some], axis=1)[:, None])
-    known = share[some] + np.maximum(1.0 - share[some].sum(axis=1), 0.0)[:, None] * usual
-    found[some] = log_of(stays * known + (1.0 - stays) * np.exp(log_weight[some] - total)) + total
+    some = np.flatnonzero((kept > 0.0) & np.isfinite(before).any(axis=0))
+    total, stays = log_sum(log_weight[:, some], axis=0), kept[some]
+    usual = np.exp(before[:, some] - log_sum(before[:, some], axis=0))
+    known = share[:, some]
+    known = known + np.maximum(1.0 - known.sum(axis=0), 0.0) * usual
+    fresh = np.exp(log_weight[:, some] - total)
+    found[:, some] = log_of(stays * known + (1.0 - stays) * fresh) + total
     return found
 
 
 def site(
-    found: MomentPosterior, mean: FloatArray, covariance: FloatArray
+    alpha: FloatArray, curvature: FloatArray, mean: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return W and b of the normal factor that stands for a moment.
+    """Return W (..., channel, channel) and b (..., channel) of the factor that stands for a moment.
 
         Cov[f] = (K^-1 + W)^-1    W = (I - B K)^-1 B,    b = W E[f] + alpha
 
     Args:
-        found: What the moment says.
-        mean: m, (row, channel) [m].
-        covariance: K, (row, channel, channel) [m2].
+        alpha: What the moment says, (..., channel).
+        curvature: B, (..., channel, channel).
+        mean: m, (..., channel) [m].
+        covariance: K, (..., channel, channel) [m2].
     """
     eye = np.eye(mean.shape[-1])
-    W = np.linalg.solve(eye - found.curvature @ covariance, found.curvature)
+    W = np.linalg.solve(eye - curvature @ covariance, curvature)
     values, vectors = np.linalg.eigh(0.5 * (W + np.swapaxes(W, -1, -2)))
     W = (vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    middle = mean + np.matmul(covariance, found.alpha[..., None])[..., 0]
-    return W, np.matmul(W, middle[..., None])[..., 0] + found.alpha
+    middle = mean + np.matmul(covariance, alpha[..., None])[..., 0]
+    return W, np.matmul(W, middle[..., None])[..., 0] + alpha
 
 
 AGREE_NATS = 1.5
@@ -224,30 +249,26 @@ def refine(rows: FilterRows, found: RowsPosterior) -> RowsPosterior:
     """
     sites, usable = _Sites.of(rows, found), rows.usable
     log_evidence = np.zeros(usable.shape)
-    shares = found.share.copy()
+    again = RowsPosterior(*(getattr(found, field.name).copy() for field in fields(found)))
     for m in range(usable.shape[1]):
         some = np.flatnonzero(usable[:, m])
         if not len(some):
             continue
         here, spread = sites.without(m, some)
-        mixture = replace(rows.mixture_at(m)[some], log_weight=found.log_weight[some, m])
-        says = moment_posterior(mixture, here, spread, rows.noise)
-        W, b = site(says, here, spread)
+        mixture = replace(rows.mixture_at(m)[some], log_weight=found.log_weight[some, m].T)
+        says = moment_posterior(mixture, here.T, packed(spread), rows.noise)
+        alpha, B = says.alpha.T, unpacked(says.curvature)
+        W, b = site(alpha, B, here, spread)
         log_evidence[some, m] = says.log_evidence - _log_integral(W, b, here, spread)
-        shares[some, m] = says.share
+        again.alpha[some, m], again.curvature[some, m] = alpha, B
+        again.ahead[some, m], again.doubt[some, m] = here, spread
+        again.share[some, m] = says.share.T
         sites.put(m, some, W, b)
     total = log_evidence.sum(axis=1) + sites.log_integral
-    agree = np.abs(total - found.total) < AGREE_NATS
-    f, z = sites.moments
-    return RowsPosterior(
-        found.log_evidence + np.where(agree, total - found.total, 0.0)[:, None] / usable.shape[1],
-        np.where(agree[:, None, None, None], sites.information, found.information),
-        np.where(agree[:, None, None], sites.shift, found.shift),
-        np.where(agree[:, None, None], shares, found.share),
-        found.log_weight,
-        np.where(agree[:, None, None], f, found.mean),
-        np.where(agree[:, None], z, found.amount),
-    )
+    again.mean[:], again.amount[:], again.amount_spread[:] = sites.moments
+    again.log_evidence[:] += (total - found.total)[:, None] / usable.shape[1]
+    agree = np.flatnonzero(np.abs(total - found.total) < AGREE_NATS)
+    return found.with_rows(agree, again[agree])
 
 
 @dataclass
@@ -273,7 +294,7 @@ class _Sites:
     @classmethod
     def of(cls, rows: FilterRows, found: RowsPosterior) -> _Sites:
         prior_mean, prior = rows.prior
-        information, shift = found.information.copy(), found.shift.copy()
+        information, shift = (part.copy() for part in found.sites)
         f, whole = _given(prior_mean, prior, information, shift)
         return cls(prior_mean, prior, information, shift, f, whole)
 
@@ -301,15 +322,16 @@ class _Sites:
         self.information[some, m], self.shift[some, m] = W, b
 
     @property
-    def moments(self) -> tuple[FloatArray, FloatArray]:
-        """Mean of f (row, moment, channel), and mean and variance of z (row, 2)."""
-        f = self.f[:, :-1].reshape(self.shift.shape)
-        return f, np.stack([self.f[:, -1], self.whole[:, -1, -1]], axis=1)
+    def moments(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean of f (row, moment, channel), mean and covariance of z (row, amount, ...)."""
+        size = self.shift.shape[1] * self.shift.shape[2]
+        f = self.f[:, :size].reshape(self.shift.shape)
+        return f, self.f[:, size:], self.whole[:, size:, size:]
 
     @property
     def log_integral(self) -> FloatArray:
         """Log of the integral of the prior times all factors, (row,)."""
-        W, b = _stacked(self.information, self.shift)
+        W, b = _stacked(self.information, self.shift, self.f.shape[1])
         return _log_integral(W, b, self.prior_mean, self.prior)
 
 
@@ -318,11 +340,12 @@ def _at(m: int, shift: FloatArray) -> slice:
     return slice(m * channels, (m + 1) * channels)
 
 
-def _stacked(information: FloatArray, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the factors of all moments as one of f and z."""
-    rows, moments, channels = shift.shape
-    size = moments * channels
-    W, b = np.zeros((rows, size + 1, size + 1)), np.zeros((rows, size + 1))
+def _stacked(
+    information: FloatArray, shift: FloatArray, numbers: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the factors of all moments as one of f and z, of so many numbers."""
+    rows, moments, _ = shift.shape
+    W, b = np.zeros((rows, numbers, numbers)), np.zeros((rows, numbers))
     for m in range(moments):
         at = _at(m, shift)
         W[:, at, at], b[:, at] = information[:, m], shift[:, m]
@@ -333,7 +356,7 @@ def _given(
     mean: FloatArray, prior: FloatArray, information: FloatArray, shift: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean and covariance of f and z given the factors of all moments."""
-    W, b = _stacked(information, shift)
+    W, b = _stacked(information, shift, mean.shape[-1])
     system = np.eye(mean.shape[-1]) + W @ prior
     pull = b - np.matmul(W, mean[..., None])[..., 0]
     alpha = np.linalg.solve(system, pull[..., None])

@@ -11,7 +11,8 @@ covariance of f are sums in closed form. With C_aq = K + S_a / lambda_q and thei
     Cov[f] = K - K B K
 
 Laplace's method at the mode, with the expected information as curvature, takes an unknown moment
-for half a nat more than it says; these moments are exact. Arrays have rows of hypotheses first.
+for half a nat more than it says; these moments are exact. Arrays have rows of hypotheses last, and
+matrices are packed (`symmetric`), so that each step runs over all rows at once.
 
 Section: docs/inference.md#integral
 """
@@ -24,8 +25,9 @@ from functools import cached_property, lru_cache
 import numpy as np
 from scipy.optimize import least_squares
 
-from failuretwin.core.numerics import log_fall, log_norm, log_sum
-from failuretwin.core.types import FloatArray, IntArray, as_floats
+from failuretwin.core.numerics import log_fall, log_norm
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.inference.engine import symmetric
 
 NORMALS = 5
 """Normal distributions that stand for a Student t."""
@@ -33,8 +35,9 @@ FURTHEST = 300.0
 """Squared distance up to which they do: further off all is an outlier."""
 NEARLY_NORMAL = 200.0
 """Degrees of freedom from which one normal distribution stands for it."""
-KEPT = 6
-"""Outcomes of a moment that are integrated in full; the rest count with their density."""
+KEPT_NATS = 5.0
+"""Outcomes of a moment that are integrated in full: the best, and those so near to it or to the
+outlier; the rest count with their density."""
 
 
 @lru_cache
@@ -92,9 +95,9 @@ class Mixture:
     """The outcomes of one moment.
 
     Attributes:
-        residual: r_a, (row, outcome, channel) [m].
-        scale: S_a, (row, outcome, channel, channel) [m2].
-        log_weight: log w_a, (row, outcome).
+        residual: r_a, (channel, outcome, row) [m].
+        scale: S_a, packed, (entry, outcome, row) [m2].
+        log_weight: log w_a, (outcome, row).
     """
 
     residual: FloatArray
@@ -103,7 +106,14 @@ class Mixture:
 
     def __getitem__(self, rows: IntArray) -> Mixture:
         """Return some of the rows."""
-        return Mixture(self.residual[rows], self.scale[rows], self.log_weight[rows])
+        if len(rows) == self.log_weight.shape[-1]:  # all of them
+            return self
+        return Mixture(self.residual[..., rows], self.scale[..., rows], self.log_weight[:, rows])
+
+    @property
+    def by_row(self) -> tuple[FloatArray, FloatArray]:
+        """r_a (row, outcome, channel) and S_a (row, outcome, channel, channel)."""
+        return self.residual.T, np.swapaxes(symmetric.unpacked(self.scale), 0, 1)
 
 
 @dataclass(frozen=True)
@@ -112,9 +122,9 @@ class MomentPosterior:
 
     Attributes:
         log_evidence: log Z, (row,).
-        alpha: (row, channel).
-        curvature: B, (row, channel, channel).
-        share: Share of each outcome, (row, outcome); what is missing to 1 is the outlier's.
+        alpha: (channel, row).
+        curvature: B, packed, (entry, row).
+        share: Share of each outcome, (outcome, row); what is missing to 1 is the outlier's.
     """
 
     log_evidence: FloatArray
@@ -130,74 +140,119 @@ def moment_posterior(
 
     Args:
         mixture: The outcomes under each row.
-        mean: m, (row, channel) [m].
-        covariance: K, (row, channel, channel) [m2].
+        mean: m, (channel, row) [m].
+        covariance: K, packed, (entry, row) [m2].
         noise: The Student t of residuals.
     """
     error = mixture.residual - mean[:, None]
-    wide, log_determinant = inverse(mixture.scale + covariance[:, None])
-    square = np.einsum("rai,raij,raj->ra", error, wide, error)
+    precision, log_determinant = symmetric.inverse(mixture.scale + covariance[:, None])
+    square = symmetric.dot(error, symmetric.times(precision, error))
     glance = mixture.log_weight + noise.log_density(square, log_determinant)
-    count = min(KEPT, glance.shape[1])
-    kept = np.argpartition(-glance, count - 1, axis=1)[:, :count]
-    rows = np.arange(len(kept))[:, None]
-    error = error[rows, kept]
-    factors, log_omega = scale_mixture(noise.dof, noise.dims)
-    total = (
-        covariance[:, None, None] + mixture.scale[rows, kept][:, :, None] / factors[:, None, None]
+    best = np.argmax(glance, axis=0)
+    highest = glance[best, np.arange(len(best))]
+    kept = glance > np.maximum(highest, noise.log_outlier) - KEPT_NATS
+    kept[best, np.arange(len(best))] = True
+    row, outcome = np.nonzero(kept.T)  # outcomes of a row stand together
+    begin = np.flatnonzero(np.diff(row, prepend=-1))
+    terms = _Terms.of(
+        error[:, outcome, row],
+        mixture.scale[:, outcome, row],
+        mixture.log_weight[outcome, row],
+        covariance[:, row],
+        noise,
     )
-    solved, log_determinant = inverse(total)  # (row, kept, normal, channel, channel)
-    pull = np.einsum("raqij,raj->raqi", solved, error)
-    square = np.einsum("rai,raqi->raq", error, pull)
-    dims = noise.dims
-    surplus = 0.5 * (mixture.residual.shape[-1] - dims) * np.log(factors)
-    term = mixture.log_weight[rows, kept][..., None] + log_omega - surplus
-    term = term - 0.5 * (square + log_determinant + dims * np.log(2.0 * np.pi))
-    rest = glance + _ratio(term, glance[rows, kept])[:, None]
-    np.put_along_axis(rest, kept, -np.inf, axis=1)
-    top = np.maximum(np.maximum(term.max(axis=(1, 2)), rest.max(axis=1)), noise.log_outlier)
-    share = np.exp(term - top[:, None, None])
-    left = np.exp(rest - top[:, None])
-    sum_of_all = share.sum(axis=(1, 2)) + left.sum(axis=1) + np.exp(noise.log_outlier - top)
-    share /= sum_of_all[:, None, None]
-    left /= sum_of_all[:, None]
-    of_kept = share.sum(axis=(1, 2))  # those that are left pull as these do
-    counted = share * (1.0 + left.sum(axis=1) / np.maximum(of_kept, 1e-300))[:, None, None]
-    alpha = np.einsum("raq,raqi->ri", counted, pull)
-    curvature = np.einsum("raq,raqij->rij", counted, solved)
-    curvature -= np.einsum("raq,raqi,raqj->rij", counted, pull, pull, optimize=True)
-    curvature += alpha[:, :, None] * alpha[:, None]
-    np.put_along_axis(left, kept, share.sum(axis=2), axis=1)
-    return MomentPosterior(top + np.log(sum_of_all), alpha, curvature, left)
+    # What is left of f counts as scatter at the glance: wrong by as much for the others.
+    exact = _log_sum_by_row(terms.log_height, begin, row)
+    rough = _log_sum_by_row(glance[outcome, row], begin, row)
+    possible = np.isfinite(exact) & np.isfinite(rough)
+    ratio = np.where(possible, exact - np.where(possible, rough, 0.0), 0.0)
+    rest = np.where(kept, -np.inf, glance + ratio)
+    top = np.maximum(np.where(possible, exact, -np.inf), noise.log_outlier)
+    share = np.exp(rest - top)
+    left = share.sum(axis=0)
+    height = np.exp(terms.log_height - top[row])
+    of_kept = np.add.reduceat(height, begin)
+    total = of_kept + left + np.exp(noise.log_outlier - top)
+    share[outcome, row] = height
+    share /= total
+    # Those that are left pull as these do.
+    counted = (1.0 + left / np.maximum(of_kept, 1e-300)) / total
+    alpha, curvature = terms.pooled(top, row, begin, counted)
+    return MomentPosterior(top + np.log(total), alpha, curvature, share)
 
 
-def _ratio(term: FloatArray, glance: FloatArray) -> FloatArray:
-    """Return the log of what kept outcomes say over their density at the first glance, (row,).
+@dataclass(frozen=True)
+class _Terms:
+    """Outcomes of all rows that are integrated in full, (term,) each.
 
-    The glance takes what is not known of f for the scale of the Student t. The outcomes that are
-    left count as wrongly as those that are kept.
+    Attributes:
+        log_height: Log of weight times integral.
+        log_normal: The same of each normal distribution, (normal, term).
+        pull: C^-1 (r - m), (channel, normal, term).
+        precision: C^-1, packed, (entry, normal, term).
+    """
+
+    log_height: FloatArray
+    log_normal: FloatArray
+    pull: FloatArray
+    precision: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        error: FloatArray,
+        scale: FloatArray,
+        log_weight: FloatArray,
+        covariance: FloatArray,
+        noise: Noise,
+    ) -> _Terms:
+        """Integrate outcomes: r - m (channel, term), S and K packed, log w (term,)."""
+        factors, log_omega = scale_mixture(noise.dof, noise.dims)
+        total = covariance[:, None] + scale[:, None] / factors[:, None]
+        precision, log_determinant = symmetric.inverse(total)
+        error = error[:, None]
+        pull = symmetric.times(precision, error)
+        surplus = 0.5 * (len(error) - noise.dims) * np.log(factors)
+        constant = log_omega - surplus - 0.5 * noise.dims * np.log(2.0 * np.pi)
+        log_normal = -0.5 * (symmetric.dot(error, pull) + log_determinant)
+        log_normal += constant[:, None]
+        log_normal += log_weight
+        top = log_normal.max(axis=0)
+        safe = np.where(np.isfinite(top), top, 0.0)
+        with np.errstate(divide="ignore"):
+            log_height = np.log(np.exp(log_normal - safe).sum(axis=0)) + safe
+        return cls(log_height, log_normal, pull, precision)
+
+    def pooled(
+        self, top: FloatArray, row: IntArray, begin: IntArray, counted: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return alpha (channel, row) and B (entry, row), summed over the terms of each row.
+
+        Args:
+            top: Log of what heights are shares of, (row,).
+            row: Row of each term.
+            begin: First term of each row, (row,).
+            counted: Factor on the heights of each row, (row,).
+        """
+        share = np.exp(self.log_normal - top[row]) * counted[row]
+        pulled = share * self.pull
+        alpha = np.add.reduceat(pulled.sum(axis=1), begin, axis=-1)
+        rows, columns = symmetric.entries(len(alpha))
+        curvature = share * self.precision - pulled[rows] * self.pull[columns]
+        return alpha, np.add.reduceat(curvature.sum(axis=1), begin, axis=-1) + symmetric.outer(
+            alpha
+        )
+
+
+def _log_sum_by_row(values: FloatArray, begin: IntArray, row: IntArray) -> FloatArray:
+    """Return log(sum(exp(values))) of the terms of each row, (row,).
 
     Args:
-        term: Integrals of the kept outcomes, (row, kept, normal).
-        glance: Their density, (row, kept).
+        values: (term,).
+        begin: First term of each row.
+        row: Row of each term.
     """
-    exact, rough = log_sum(term, axis=(1, 2)), log_sum(glance, axis=1)
-    known = np.isfinite(exact) & np.isfinite(rough)
-    return np.where(known, exact - np.where(known, rough, 0.0), 0.0)
-
-
-def inverse(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return inverse and log determinant of symmetric matrices; three channels in closed form."""
-    if matrix.shape[-1] != 3:
-        return as_floats(np.linalg.inv(matrix)), as_floats(np.linalg.slogdet(matrix)[1])
-    xx, yy, zz = matrix[..., 0, 0], matrix[..., 1, 1], matrix[..., 2, 2]
-    xy, xz, yz = matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2]
-    found = np.empty(matrix.shape)
-    found[..., 0, 0], found[..., 1, 1] = yy * zz - yz * yz, xx * zz - xz * xz
-    found[..., 2, 2] = xx * yy - xy * xy
-    found[..., 0, 1] = found[..., 1, 0] = xz * yz - xy * zz
-    found[..., 0, 2] = found[..., 2, 0] = xy * yz - xz * yy
-    found[..., 1, 2] = found[..., 2, 1] = xy * xz - xx * yz
-    determinant = xx * found[..., 0, 0] + xy * found[..., 0, 1] + xz * found[..., 0, 2]
-    found /= determinant[..., None, None]
-    return found, np.log(determinant)
+    top = np.maximum.reduceat(values, begin)
+    safe = np.where(np.isfinite(top), top, 0.0)
+    with np.errstate(divide="ignore"):
+        return np.log(np.add.reduceat(np.exp(values - safe[row]), begin)) + safe

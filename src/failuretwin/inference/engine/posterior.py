@@ -19,7 +19,8 @@ from failuretwin.core.numerics import Weighted, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.engine.picks import NarrowPart, Picks
+from failuretwin.inference.engine import symmetric
+from failuretwin.inference.engine.picks import Part, Picks
 from failuretwin.inference.engine.runs import RunsEvidence, Weighed
 from failuretwin.inference.faults.marginal import Estimate, MarginalLikelihood
 
@@ -122,7 +123,7 @@ def _rms(evidence: RunsEvidence, h: int, pick: int) -> tuple[float, float]:
     rows, one = evidence.rows[h], evidence.weighed[h]
     run, row = one.picks.run[pick], one.picks.row[pick]
     assert rows.size is not None
-    size = rows.size[evidence.narrowed[h].kept[evidence.narrowed[h].place[run, row]]]
+    size = rows.size[evidence.part(h, one.picks[pick : pick + 1]).kept[0]]
     share = np.where(np.isfinite(size), one.found.share[pick], 0.0)
     usable = evidence.scene.moments.usable[run]
     counts = usable & (np.arange(len(share)) >= rows.first[row]) & (share.sum(axis=-1) > 0.0)
@@ -137,8 +138,8 @@ def _rms(evidence: RunsEvidence, h: int, pick: int) -> tuple[float, float]:
 def _outcome_probability(evidence: RunsEvidence, h: int, pick: int) -> FloatArray:
     """Return the probability of each outcome of each movement, (movement, outcome)."""
     moments, one = evidence.scene.moments, evidence.weighed[h]
-    run, row = one.picks.run[pick], one.picks.row[pick]
-    usual = evidence.rows[h].usual[evidence.narrowed[h].kept[evidence.narrowed[h].place[run, row]]]
+    run = one.picks.run[pick]
+    usual = evidence.rows[h].usual[evidence.part(h, one.picks[pick : pick + 1]).kept[0]]
     table = np.zeros((moments.count, len(evidence.scene.model.lost_commands.lost)))
     for m in np.flatnonzero(moments.usable[run]).tolist():
         np.add.at(table[m], moments.outcome[run, m, usual[m]], one.found.share[pick, m])
@@ -234,8 +235,7 @@ def theta_of_picks(
     """
     one = evidence.weighed[h]
     picks, found = one.picks[places], one.found[places]
-    part = evidence.narrow_part(h, picks)
-    mean, covariance = theta_given(part, found.information, found.shift)
+    mean, covariance = theta_given(evidence.part(h, picks), *found.sites)
     return ThetaPart(h, places, picks, weight[places], mean, covariance)
 
 
@@ -282,12 +282,12 @@ def theta_factors(evidence: RunsEvidence) -> tuple[FloatArray, FloatArray]:
 def _factors_of(evidence: RunsEvidence, part: ThetaPart) -> tuple[FloatArray, FloatArray]:
     h, picks = part.hypothesis, part.picks
     rows, found = evidence.rows[h], evidence.weighed[h].found[part.places]
-    narrow = evidence.narrow_part(h, picks)
-    G = narrow.narrow.columns[narrow.place]
+    G = evidence.part(h, picks).columns
     lever = rows.lever[picks.run, picks.row]
     A = np.concatenate([G, lever[..., None]], axis=-1)
-    whole = np.einsum("pmct,pmcd,pmdu->ptu", A, found.information, A, optimize=True)
-    pull = np.einsum("pmct,pmc->pt", A, found.shift)
+    W, b = found.sites
+    whole = np.einsum("pmct,pmcd,pmdu->ptu", A, W, A, optimize=True)
+    pull = np.einsum("pmct,pmc->pt", A, b)
     variance = rows.variance[picks.run, picks.row]
     own = whole[:, -1, -1] + 1.0 / np.maximum(variance, 1e-18)
     across = whole[:, :-1, -1]
@@ -304,14 +304,15 @@ def misfit_of(evidence: RunsEvidence) -> FloatArray:
     total = np.zeros(evidence.scene.moments.runs)
     for part in theta_parts(evidence):
         found = evidence.weighed[part.hypothesis].found[part.places]
-        narrow = evidence.narrow_part(part.hypothesis, part.picks)
+        ready = evidence.part(part.hypothesis, part.picks)
         usable = evidence.scene.moments.usable[part.picks.run]
         square = np.zeros(usable.shape)
         for m in range(usable.shape[1]):
-            mixture, share = narrow.mixture_at(m), found.share[:, m]
-            off = mixture.residual - found.mean[:, None, m]
-            solved = np.linalg.solve(mixture.scale, off[..., None])[..., 0]
-            square[:, m] = np.sum(share * np.sum(off * solved, axis=-1), axis=1)
+            mixture, share = ready.mixture_at(m), found.share[:, m]
+            off = mixture.residual - found.mean[:, m].T[:, None]
+            precision, _ = symmetric.inverse(mixture.scale)
+            distance = symmetric.dot(off, symmetric.times(precision, off))  # (outcome, pick)
+            square[:, m] = np.sum(share.T * distance, axis=0)
             square[:, m] += OUTLYING * (1.0 - share.sum(axis=1))
         mean = np.sum(np.where(usable, square, 0.0), axis=1) / np.maximum(usable.sum(axis=1), 1)
         np.add.at(total, part.picks.run, part.weight * mean)
@@ -319,7 +320,7 @@ def misfit_of(evidence: RunsEvidence) -> FloatArray:
 
 
 def theta_given(
-    part: NarrowPart, information: FloatArray, shift: FloatArray
+    part: Part, information: FloatArray, shift: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return theta of each pick given the factors of its moments: mean and covariance.
 
@@ -339,6 +340,6 @@ def theta_given(
     pull = shift.reshape(picks, size) - np.matmul(W, mean[..., None])[..., 0]
     alpha = np.linalg.solve(system, pull[..., None])
     V, mu = part.components.theta(part.picks.run, part.normal)
-    GV = part.narrow.columns[part.place].reshape(picks, size, V.shape[-1]) @ V
+    GV = part.columns.reshape(picks, size, V.shape[-1]) @ V
     turned = np.swapaxes(GV, -1, -2)
     return mu + np.matmul(turned, alpha)[..., 0], V - turned @ np.linalg.solve(system, W @ GV)

@@ -32,9 +32,8 @@ from failuretwin.inference.engine.weighing import Weighing, assembled
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.posterior import Posterior, compute_posterior, marginal_likelihoods
+from failuretwin.inference.posterior import Posterior, marginal_likelihoods
 from failuretwin.inference.set_ups.setup_prior import SetupPrior
-from failuretwin.inference.theta.shared_unknowns import layout_of as offsets_in_doubt
 
 COARSE_TO_FINE = (0.026, 0.004, 0.0)
 """Noise added while a displaced sensor is registered, as shares of the reach."""
@@ -179,10 +178,7 @@ def sensor_in_doubt(
         return False
     settled = replace(likelihood, moving=None)
     told = [*ranked, *(h for h in hypotheses if len(h.faults) > 1)]
-    if offsets_in_doubt(settled.model).offsets or settled.evidence.on_the_way.any():
-        found = robot_posterior(settled, told, priors).log_posterior
-    else:
-        found = compute_posterior(settled, told, priors).log_posterior
+    found = robot_posterior(settled, told, priors).log_posterior
     best = np.argmax(found, axis=1)
     single = np.flatnonzero(best < len(ranked))
     return bool(len(single)) and _suspect(settled[single], ranked, priors, best[single])
@@ -218,15 +214,16 @@ def _suspect(
 
 # The posterior of runs in chunks, each about the better of two registrations.
 
-CHUNK_RUNS = 16
-"""Runs that are weighed at a time: columns of all rows and outcomes stay below 100 MB."""
+CHUNK_ROWS = 1600
+"""Moments of all runs that are weighed at a time, times those of a run: rows grow with them, and
+columns of all rows and outcomes stay below 100 MB."""
 
 
 def robot_posterior(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> Posterior:
     """Return the posterior of runs whose sensor is where the profile says."""
-    chunks = _chunks(len(likelihood.usable))
+    chunks = _chunks(likelihood)
     parts = _robot_parts(likelihood, hypotheses, priors)
     return assembled(likelihood, [one.posterior() for one in parts], *_in_turn(chunks))
 
@@ -253,7 +250,7 @@ def evidence_at_once(
 def _robot_parts(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> list[Weighing]:
-    chunks = _chunks(len(likelihood.usable))
+    chunks = _chunks(likelihood)
     return [robot_weighing(likelihood[rows], hypotheses, priors) for rows in chunks]
 
 
@@ -263,7 +260,7 @@ def displaced_posterior(
     """Return the posterior of runs whose sensor may be displaced."""
     parts, better = _about_the_better(likelihood, hypotheses, priors)
     some = [one.posterior() for one in parts]
-    chunks = _chunks(len(likelihood.usable))
+    chunks = _chunks(likelihood)
     part, row = _in_turn(chunks)
     return assembled(likelihood, some, part + len(chunks) * better, row)
 
@@ -291,7 +288,7 @@ def _about_the_better(
     parts = [
         displaced_weighing(likelihood[rows], hypotheses, priors, where[rows])
         for where in places
-        for rows in _chunks(runs)
+        for rows in _chunks(likelihood)
     ]
     if len(places) == 1:
         return parts, np.zeros(runs, dtype=np.int64)
@@ -299,11 +296,13 @@ def _about_the_better(
     return parts, np.argmax(total, axis=0)
 
 
-def _chunks(runs: int) -> list[IntArray]:
-    return [np.arange(at, min(at + CHUNK_RUNS, runs)) for at in range(0, runs, CHUNK_RUNS)]
+def _chunks(likelihood: RunLikelihood) -> list[IntArray]:
+    runs, moments = likelihood.usable.shape
+    some = max(1, CHUNK_ROWS // max(moments, 1) ** 2)
+    return [np.arange(at, min(at + some, runs)) for at in range(0, runs, some)]
 
 
 def _in_turn(chunks: Sequence[IntArray]) -> tuple[IntArray, IntArray]:
     """Return the chunk and the place in it of each run."""
-    part, row = np.divmod(np.concatenate(chunks), CHUNK_RUNS)
-    return part, row
+    sizes = [len(one) for one in chunks]
+    return np.repeat(np.arange(len(sizes)), sizes), np.concatenate([np.arange(n) for n in sizes])

@@ -24,7 +24,7 @@ from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.amount_rows import held_rows, offset_rows
 from failuretwin.inference.engine.filter import RowsPosterior, filter_rows, refine
-from failuretwin.inference.engine.picks import Narrowed, NarrowPart, Part, Picks, narrowed
+from failuretwin.inference.engine.picks import Part, Picks, Prepared, narrowed, prepared
 from failuretwin.inference.engine.redrawn_rows import redrawn_rows
 from failuretwin.inference.engine.rows import Rows, Scene
 from failuretwin.inference.engine.theta import Components
@@ -33,7 +33,7 @@ AMOUNT_STEPS = np.linspace(-4.0, 4.0, 33)
 """Nodes at which the prior of an amount is put in, in posterior deviations."""
 WIDEST = 0.5
 """Largest deviation at which it is, as a share of that of the normal distribution it replaces."""
-ROWS_NATS, MOST_ROWS = 6.0, 4
+ROWS_NATS, MOST_ROWS = 6.0, 3
 """Rows of a hypothesis that other components weigh: so near its best, and at most."""
 REFINED_NATS = 8.0
 """Rows whose moments are weighed again given all others: so near the best of their run."""
@@ -76,7 +76,7 @@ class Weighed:
         return Weighed(self.picks, log_evidence, self.found.with_rows(places, some.found), amount)
 
 
-CHUNK = 400
+CHUNK = 1000
 """Picks that are weighed at a time."""
 
 
@@ -125,9 +125,9 @@ class RunsEvidence:
         return [rows_of(self.scene, hypothesis) for hypothesis in self.hypotheses]
 
     @cached_property
-    def narrowed(self) -> dict[int, Narrowed]:
-        """The outcomes of each row that count, by hypothesis, once all rows are weighed."""
-        return {}
+    def prepared(self) -> list[Prepared]:
+        """Rows of each hypothesis ready for the filter: those that count, once all are weighed."""
+        return [prepared(rows, self.components) for rows in self.rows]
 
     @cached_property
     def left_out(self) -> dict[int, FloatArray]:
@@ -138,11 +138,7 @@ class RunsEvidence:
     def weighed(self) -> list[Weighed]:
         """What the rows of each hypothesis say, by the components that weigh them."""
         first = [self.weigh(h, self._all_rows(h)) for h in range(len(self.rows))]
-        for h, one in enumerate(first):
-            self.narrowed[h] = self._narrowed(h, one)
-        kept = [self._near_best(h, one) for h, one in enumerate(first)]
-        for h, one in enumerate(first):
-            self.left_out[h] = self._left_out(h, one, kept[h])
+        kept = [self._narrow(h, one) for h, one in enumerate(first)]
         wanted = self._wanted(first)
         widest = self._widest(wanted)
         runs = np.arange(len(wanted))
@@ -219,9 +215,9 @@ class RunsEvidence:
         weight = self.components.weight(one.picks.run, one.picks.component)
         return one.log_evidence + weight + self.log_odds[h]
 
-    def narrow_part(self, h: int, picks: Picks) -> NarrowPart:
+    def part(self, h: int, picks: Picks) -> Part:
         """Return some picks of a hypothesis, ready for the filter."""
-        return NarrowPart(self.scene, self.rows[h], picks, self.components, self.narrowed[h])
+        return Part(self.scene, self.rows[h], picks, self.components, self.prepared[h])
 
     def _all_rows(self, h: int) -> Picks:
         possible = np.isfinite(self.rows[h].log_prior)
@@ -230,32 +226,20 @@ class RunsEvidence:
         run, row = np.nonzero(possible)
         return Picks(run, row, np.zeros_like(row))
 
-    def _narrowed(self, h: int, one: Weighed) -> Narrowed:
-        """Return the outcomes that count, of the rows that come near the best of a hypothesis."""
-        table = np.full(self.rows[h].log_prior.shape, -np.inf)
-        table[one.picks.run, one.picks.row] = one.log_evidence
-        near = table > table.max(axis=1, keepdims=True) - ROWS_NATS
-        some = np.flatnonzero(near[one.picks.run, one.picks.row])
-        share = one.found.share[some]
-        return narrowed(self.scene, self.rows[h], one.picks[some], share, self.components)
-
-    def _near_best(self, h: int, one: Weighed) -> Picks:
-        """Return the rows of a hypothesis that come near its best, in each run."""
+    def _narrow(self, h: int, one: Weighed) -> Picks:
+        """Keep the rows of a hypothesis that come near its best, with the outcomes that count."""
         table: FloatArray = np.full(self.rows[h].log_prior.shape, -np.inf)
         table[one.picks.run, one.picks.row] = one.log_evidence
-        best = table.max(axis=1, keepdims=True)
         most = min(MOST_ROWS, table.shape[1])
-        least = np.sort(table, axis=1)[:, -most, None]
-        run, row = np.nonzero((table > best - ROWS_NATS) & (table >= least))
-        return Picks(run, row, np.zeros_like(row))
-
-    def _left_out(self, h: int, one: Weighed, kept: Picks) -> FloatArray:
-        table: FloatArray = np.full(self.rows[h].log_prior.shape, -np.inf)
-        table[one.picks.run, one.picks.row] = one.log_evidence
-        some = np.full_like(table, -np.inf)
-        some[kept.run, kept.row] = table[kept.run, kept.row]
-        whole, part = log_sum(table, axis=1), log_sum(some, axis=1)
-        return np.where(np.isfinite(part), whole - np.where(np.isfinite(part), part, 0.0), 0.0)
+        least = np.maximum(table.max(axis=1) - ROWS_NATS, np.sort(table, axis=1)[:, -most])
+        near = (table >= least[:, None]) & np.isfinite(table)
+        some = np.flatnonzero(near[one.picks.run, one.picks.row])
+        kept, share = one.picks[some], one.found.share[some]
+        self.prepared[h] = narrowed(self.scene, self.rows[h], kept, share, self.components)
+        whole, part = log_sum(table, axis=1), log_sum(np.where(near, table, -np.inf), axis=1)
+        possible = np.isfinite(part)
+        self.left_out[h] = np.where(possible, whole - np.where(possible, part, 0.0), 0.0)
+        return kept
 
     def _wanted(self, first: Sequence[Weighed]) -> BoolArray:
         """Return which components weigh each run in full, (run, component)."""
@@ -302,23 +286,17 @@ class RunsEvidence:
         return Weighed.joined(parts)
 
     def _weigh(self, h: int, picks: Picks, before: RowsPosterior | None) -> Weighed:
-        rows = self.rows[h]
-        part: Part | NarrowPart
-        if h in self.narrowed:
-            part = self.narrow_part(h, picks)
-        else:
-            G = rows.columns[picks.run, picks.row_of(rows.columns)]
-            part = Part(self.scene, rows, picks, self.components, G, G[:, :, :1])
-        ready = part.filter_rows
+        rows, ready = self.rows[h], self.part(h, picks).filter_rows
         found = filter_rows(ready) if before is None else refine(ready, before)
         total = found.total + rows.log_prior[picks.run, picks.row]
         if h in self.left_out:
             total = total + self.left_out[h][picks.run]
-        amount = found.amount.copy()
-        amount[:, 1] = np.sqrt(np.maximum(amount[:, 1], 0.0))
-        amount[:, 0] += rows.centre[picks.run, picks.row]
-        if rows.amount_prior is not None:
-            gain, amount = _with_amount_prior(rows, picks, found.amount)
+        amount = np.stack([found.amount[:, 0], found.amount_spread[:, 0, 0]], axis=1)
+        if rows.amount_prior is None:
+            amount[:, 1] = np.sqrt(np.maximum(amount[:, 1], 0.0))
+            amount[:, 0] += rows.centre[picks.run, picks.row]
+        else:
+            gain, amount = _with_amount_prior(rows, picks, amount)
             total = total + gain
         return Weighed(picks, total, found, amount)
 

@@ -24,7 +24,7 @@ from scipy.special import digamma, polygamma
 
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.inference.engine.filter import RowsPosterior
-from failuretwin.inference.engine.picks import NarrowPart
+from failuretwin.inference.engine.picks import Part
 from failuretwin.inference.engine.posterior import ThetaPart
 from failuretwin.inference.engine.runs import RunsEvidence
 
@@ -55,24 +55,25 @@ def scatter_information(evidence: RunsEvidence, part: ThetaPart) -> ScatterInfor
     faults = evidence.hypotheses[part.hypothesis].faults
     healthy = ~np.isin(model.motor_names, [fault.motor for fault in faults])
     found = evidence.weighed[part.hypothesis].found[part.places]
-    narrow = evidence.narrow_part(part.hypothesis, part.picks)
+    ready = evidence.part(part.hypothesis, part.picks)
     motors = len(healthy)
     zeros = slice(evidence.scene.layout.offsets.start, evidence.scene.layout.offsets.start + motors)
     total = ScatterInformation(
         np.zeros((len(part.picks.run), motors + 1)),
         np.zeros((len(part.picks.run), motors + 1, motors + 1)),
     )
-    for m in range(found.shift.shape[1]):
-        G = narrow.narrow.columns[narrow.place, m]
+    columns = ready.columns
+    for m in range(found.mean.shape[1]):
+        G = columns[:, m]
         levers = G[..., zeros] * np.where(healthy, model.scatter, 0.0)
         covariance = G @ part.covariance @ np.swapaxes(G, -1, -2)
-        _add(total, narrow, found, m, levers, covariance, noise.dof)
+        _add(total, ready, found, m, levers, covariance, noise.dof)
     return total
 
 
 def _add(
     total: ScatterInformation,
-    part: NarrowPart,
+    part: Part,
     found: RowsPosterior,
     m: int,
     levers: FloatArray,
@@ -80,9 +81,9 @@ def _add(
     nu: float,
 ) -> None:
     """Add what one moment says."""
-    mixture, weight = part.mixture_at(m), found.share[:, m]  # (pick, outcome)
-    off = mixture.residual - found.mean[:, None, m]
-    whitening = np.linalg.inv(np.linalg.cholesky(mixture.scale))
+    (residual, scale), weight = part.mixture_at(m).by_row, found.share[:, m]  # (pick, outcome)
+    off = residual - found.mean[:, None, m]
+    whitening = np.linalg.inv(np.linalg.cholesky(scale))
     off = np.matmul(whitening, off[..., None])[..., 0]
     lever = np.matmul(whitening, levers[:, None])  # (pick, outcome, channel, motor)
     dims, square = off.shape[-1], np.sum(off**2, axis=-1)
@@ -127,8 +128,8 @@ def outcome_shares(evidence: RunsEvidence, part: ThetaPart) -> FloatArray:
     """Return the share of each outcome of each movement, (pick, movement, outcome of all)."""
     moments, rows = evidence.scene.moments, evidence.rows[part.hypothesis]
     found = evidence.weighed[part.hypothesis].found[part.places]
-    narrow = evidence.narrow_part(part.hypothesis, part.picks)
-    usual: IntArray = rows.usual[narrow.narrow.kept[narrow.place]]  # (pick, moment, outcome)
+    ready = evidence.part(part.hypothesis, part.picks)
+    usual: IntArray = rows.usual[ready.kept]  # (pick, moment, outcome)
     run = part.picks.run
     count = len(evidence.scene.model.lost_commands.lost)
     table = np.zeros((*usual.shape[:2], count))

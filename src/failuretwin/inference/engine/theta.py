@@ -21,7 +21,7 @@ from failuretwin.core.numerics import log_of
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.theta.shared_unknowns import loads, offset_deviation, typical_load
+from failuretwin.inference.theta.shared_unknowns import loads, offset_deviation
 
 REGISTRATION = 7
 """Length of the registration in theta: origin, turn and scale."""
@@ -123,6 +123,18 @@ class Components:
     def __len__(self) -> int:
         """How many."""
         return len(self.sigma)
+
+    @property
+    def unknown(self) -> IntArray:
+        """Places in theta that are not known in every component, (place,)."""
+        variance = np.diagonal(self.covariance, axis1=-2, axis2=-1)
+        widest = variance.reshape(-1, variance.shape[-1]).max(axis=0)
+        return np.flatnonzero((widest > 2.0 * KNOWN**2) | self._moved)
+
+    @property
+    def _moved(self) -> BoolArray:
+        """Places in theta whose mean is not 0 everywhere, (theta,)."""
+        return np.asarray((self.mean != 0.0).reshape(-1, self.mean.shape[-1]).any(axis=0))
 
     @property
     def usual(self) -> FloatArray:
@@ -270,9 +282,7 @@ def _covariance(model: HealthyModel, layout: Layout, factor: float) -> FloatArra
     deviation = np.full(layout.size, KNOWN)
     constant, turned = model.sensors.deviations
     deviation[:3], deviation[3:6] = max(constant, KNOWN), max(turned, KNOWN)
-    least = np.full(3 * motors, KNOWN)
-    least[motors : 2 * motors] /= np.maximum(typical_load(model), 1e-3)
-    deviation[layout.offsets] = np.maximum(factor * offset_deviation(model), least)
+    deviation[layout.offsets] = np.maximum(factor * offset_deviation(model), KNOWN)
     if layout.geometry:
         deviation[layout.frames] = factor * frame_deviation(model.twin.robot)
     covariance = np.diag(deviation**2)

@@ -133,18 +133,26 @@ class Weighing:
     @cached_property
     def log_evidence(self) -> FloatArray:
         """Log of weight times evidence, (run, component, hypothesis)."""
-        found = self.evidence.log_evidence
-        if len(self.with_rows) == len(self.hypotheses) and self.likelihood.moving is None:
-            return found
+        if self.likelihood.moving is None:
+            return self._log_settled
         settled, whole = (
             np.stack([one.log_evidence for one in says], axis=1)
             for says in (self._settled_at_best, self._whole_at_best)
         )
+        return np.asarray(self._log_settled + (whole - settled)[:, None])
+
+    @cached_property
+    def _log_settled(self) -> FloatArray:
+        """The same by settled positions alone."""
+        found = self.evidence.log_evidence
+        if len(self.with_rows) == len(self.hypotheses):
+            return found
+        settled = np.stack([one.log_evidence for one in self._settled_at_best], axis=1)
         rows, (best, _) = np.arange(len(found)), self.best
         more = settled - settled[rows, self.with_rows[best], None]
         table = found[rows, :, best][..., None] + more[:, None]
         table[..., self.with_rows] = found
-        return np.asarray(table + (whole - settled)[:, None])
+        return np.asarray(table)
 
     @property
     def by_hypothesis(self) -> FloatArray:
@@ -178,6 +186,7 @@ class Weighing:
             self.weights(),
             self.remarks,
             self.odd_zeros,
+            log_settled=log_sum(log_sum(self._log_settled, axis=1) + self.log_odds, axis=1),
         )
 
     @cached_property
@@ -284,4 +293,5 @@ def assembled(
         [weight(h) for h in range(len(first.hypotheses))],
         [parts[p].set_up[r] if parts[p].set_up else "" for p, r in places],
         [parts[p].offsets[r] if parts[p].offsets else "" for p, r in places],
+        log_settled=np.array([parts[p].settled_evidence[r] for p, r in places]),
     )

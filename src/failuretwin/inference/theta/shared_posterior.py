@@ -16,7 +16,6 @@ from failuretwin.inference.engine.weighing import assembled
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.posterior import Posterior, compute_posterior
-from failuretwin.inference.theta.shared_unknowns import layout_of
 
 
 def shared_posterior(
@@ -24,7 +23,7 @@ def shared_posterior(
 ) -> Posterior:
     """Weigh every hypothesis by some runs, what they share integrated out.
 
-    Where no hypothesis has rows, theta is taken as told; so it is where nothing of it is unknown.
+    Where no hypothesis has rows, theta is taken as told.
 
     Args:
         likelihood: The runs as they were seen.
@@ -44,7 +43,4 @@ def shared_posterior(
         return compute_posterior(likelihood, hypotheses, priors)
     if in_doubt:
         return displaced_posterior(likelihood, hypotheses, priors)
-    unknown = layout_of(likelihood.model).offsets or likelihood.model.sensors.in_doubt
-    if unknown or moving.any():
-        return robot_posterior(likelihood, hypotheses, priors)
-    return compute_posterior(likelihood, hypotheses, priors)
+    return robot_posterior(likelihood, hypotheses, priors)
