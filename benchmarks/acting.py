@@ -34,9 +34,8 @@ from failuretwin.connection.links.base import Order
 from failuretwin.core.hypothesis import Fault, Hypothesis, single_faults
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.decision.acting.actor import Actor
-from failuretwin.decision.acting.belief import CAP, LATCH, Belief
+from failuretwin.decision.acting.belief import ACTED_ON, CAP, LATCH, Belief, Judge, Judgement
 from failuretwin.decision.acting.believed_arm import BelievedFault, Seen
-from failuretwin.decision.acting.judging import ACTED_ON, Judge, Judgement
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import ActingSettings, TargetResult, Task
@@ -118,11 +117,21 @@ class Loop:
         self.world = World(trial.known, trial.faults, trial.seed, trial.engine,
                            trial.redrawn_at_rest, trial.onset)  # fmt: skip
         self.model = HealthyModel.of(trial.known.twin, trial.known.imperfections)
-        self.judge = Judge(self.model, hypotheses=self._weighed())
+        judge = Judge(self.model, self._weighed()) if self.strategy == "diagnose" else None
         planner = Planner(SafetyGate(trial.known.robot))
         settings = ActingSettings(feedback=self.strategy != "open")
+        self.said: list[list[str]] = [[] for _ in trial.tasks]
         self.actors = [
-            Actor(planner, self.model, task, self._belief(i), self.world.home[i], settings)
+            Actor(
+                planner,
+                self.model,
+                task,
+                self._belief(i),
+                self.world.home[i],
+                settings,
+                judge,
+                self.said[i].append,
+            )
             for i, task in enumerate(trial.tasks)
         ]
         self.latched = np.full(len(self.actors), np.nan)
@@ -146,7 +155,7 @@ class Loop:
         for arm, actor in enumerate(self.actors):
             believed = actor.belief.believed
             wrong = believed is not None and not self._is_right(arm, believed)
-            self.rows.append(self._of_arm(arm) | {"said": actor.said, "false": wrong})
+            self.rows.append(self._of_arm(arm) | {"said": self.said[arm], "false": wrong})
         return self
 
     def _step(self) -> bool:
@@ -161,26 +170,17 @@ class Loop:
         start, rest = self.world.time_s, np.full(self.world.m, 0.4)
         still = self.world.commanded
         points = self.world.move([order or Order(still[i], rest) for i, order in enumerate(orders)])
+        aims = {i: self.actors[i].target.point for i in works}
         began = time.process_time()
         for i in works:
-            self.actors[i].add(points[i], start, self.world.time_s)
-        says = self._judgements([self.actors[i].belief for i in works])
-        self.judged_s += time.process_time() - began
-        aims = {i: self.actors[i].target.point for i in works}
-        for i, judgement in zip(works, says, strict=True):
-            self.actors[i].learn(judgement)
+            self.actors[i].see(points[i], start, self.world.time_s)
             self._note_latch(i)
+        self.judged_s += time.process_time() - began
         error = np.full(len(orders), np.inf)
         for i in works:
             error[i] = np.linalg.norm(self.world.tool[i] - aims[i])
         self._report(error)
         return True
-
-    def _judgements(self, beliefs: Sequence[Belief]) -> Sequence[Judgement | None]:
-        """Return the judgement of each arm; None without a diagnosis."""
-        if self.strategy != "diagnose":
-            return [None] * len(beliefs)
-        return self.judge([b.window for b in beliefs], [b.believed for b in beliefs])
 
     def _is_right(self, arm: int, believed: BelievedFault) -> bool:
         fault, stopped = self.trial.faults[arm], np.isfinite(self.world.held[arm])

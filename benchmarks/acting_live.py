@@ -60,8 +60,8 @@ def rows_of(known: CalibratedRobot, motor: int, seed: int, strategy: str) -> lis
     task = tasks_of(robot, 1, 9, 1000 * motor + seed)[0]
     acting = Acting(known, SafetyGate(robot), strategy, ActingSettings())
     standing = first_standing(arm)
-    arm.actor = actor = acting.actor(task, standing)
-    Work(actor, acting.gate, arm, standing, lambda _: None).carry_out()
+    arm.actor = actor = acting.actor(task, standing, lambda text: None)
+    Work(actor, acting.gate, arm, standing).carry_out()
     arm.note()
     held, rows = float(arm.ends[-1][1][motor]), []
     for (at, angle), result in zip(arm.ends, actor.results, strict=True):

@@ -37,8 +37,8 @@ from failuretwin.connection.emulated_arm import EmulatedArm, Shifts
 from failuretwin.connection.links.base import Order
 from failuretwin.core.hypothesis import CLEAR, RAISED, SUSPECTED, Hypothesis, paper_hypotheses
 from failuretwin.core.types import FloatArray
+from failuretwin.decision.acting.belief import settled_evidence_of
 from failuretwin.decision.acting.believed_arm import Seen
-from failuretwin.decision.acting.judging import settled_evidence_of
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.scoring import Share
 from failuretwin.decision.streaming.monitor import monitor
@@ -264,15 +264,13 @@ def further(arms: int, seed: int) -> None:
             needed[news], right[news] = count, (found.argmax(axis=1) == truth)[news]
             if count == MOST:
                 break
-            posteriors = robots.judge(windows)
             orders = []
             for i, window in enumerate(windows):
                 at = window[-1].command
                 order = None
                 if name == "designed" and was_open[i] and np.isnan(needed[i]):
-                    order = next_movement(
-                        robots.model, gate, posteriors[i // AT_ONCE], at, seed + count, i % AT_ONCE
-                    )
+                    (posterior,) = robots.judge([window])
+                    order = next_movement(robots.model, gate, posterior, at, seed + count)
                 orders.append(order or usual.random(at, 1e3, 1)[0].order)
             add(world, windows, orders, 1.6)
         told = np.where(np.isnan(needed), MOST, needed)[was_open]

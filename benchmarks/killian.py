@@ -101,11 +101,12 @@ def report(name: str, listed: Sequence[TrueRun], diagnoses: Sequence[Diagnosis])
     """Print how many are right, by kind of fault, and the wrong ones."""
     judged = Judged.of(d for run, d in zip(listed, diagnoses, strict=True) if run.judged)
     print(f"{name}: {score_line(judged)}")
-    for row in judged.scores.by_class():
-        if row.runs:
-            hits = round(row.recall * row.runs)
-            low, high = Share(hits, row.runs).interval
-            print(f"  {row.name}: {hits} of {row.runs} ({100 * low:.0f} to {100 * high:.0f} %)")
+    scores = judged.scores
+    for k, name in enumerate(scores.classes):
+        hits, runs = int(scores.confusion[k, k]), int(scores.confusion[k].sum())
+        if runs:
+            low, high = Share(hits, runs).interval
+            print(f"  {name}: {hits} of {runs} ({100 * low:.0f} to {100 * high:.0f} %)")
     healthy = [d for d in diagnoses if d.truth == "healthy"]
     alarms = sum(d.diagnosis not in ("healthy", None) for d in healthy)
     silent = sum(d.diagnosis is None for d in healthy)

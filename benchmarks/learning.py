@@ -22,7 +22,6 @@ from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expecta
 from failuretwin.decision.learned.networks import (
     NETWORKS,
     Batch,
-    Pace,
     Shape,
     Standard,
     build_network,
@@ -49,7 +48,7 @@ def paper_training(cores: int) -> float:
     classes = rng.integers(0, 9, 3240)
     torch.set_num_threads(cores)
     network = build_network("lstm", Shape(6, 9))
-    steps = training(network, shuffled_batches(features, classes, 32, rng), Pace(1000))
+    steps = training(network, shuffled_batches(features, classes, 32, rng), 1000)
     for _ in itertools.islice(steps, 10):
         pass
     begun, timed = time.perf_counter(), 60

@@ -29,7 +29,11 @@ WARM = (
         "failuretwin.connection.tracked_diagnosis",
     ),
     *("failuretwin.app.reports.calibration_report", "failuretwin.data_knowledge.generate"),
-    *("failuretwin.app.arms", "failuretwin.app.live", "failuretwin.decision.test_motions.session"),
+    *(
+        "failuretwin.app.arms",
+        "failuretwin.app.live",
+        "failuretwin.decision.test_motions.health_check",
+    ),
     *("dask.array", "matplotlib.backends.backend_agg", "mujoco", "zarr"),
 )
 LIMIT_S = 120.0

@@ -43,8 +43,7 @@ if TYPE_CHECKING:
     from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
     from failuretwin.decision.streaming.fleet import StreamingFleet
     from failuretwin.decision.streaming.monitor import monitor
-    from failuretwin.decision.test_motions.health_check import CheckResult
-    from failuretwin.decision.test_motions.session import check
+    from failuretwin.decision.test_motions.health_check import CheckResult, check
     from failuretwin.decision.training import train
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import Robot, load_robot
@@ -95,7 +94,7 @@ _HOME = {
     "act": "decision.acting.session",
     "advise": "decision.expected_cost",
     "calibrate": "connection.calibration.calibrate",
-    "check": "decision.test_motions.session",
+    "check": "decision.test_motions.health_check",
     "compare": "decision.evaluation",
     "diagnose": "inference.diagnoser",
     "emulated_arm": "app.arms",

@@ -204,7 +204,7 @@ class Unsure:
         posterior = dict(zip(names, self.believed.probability.tolist(), strict=True))
         self.diagnosis = Diagnosis("stream", posterior, undecided=undecided)
 
-    def update(self, time, command, measured):
+    def update(self, time, command, measured, position=None, goal=None):
         alarm = self.alarm if time >= self.since_s else ALL_CLEAR
         return Answer(time, OK, self.diagnosis, alarm)
 

@@ -59,7 +59,7 @@ class Notebook:
         self.told = []
         self.diagnosis = diagnosis
 
-    def update(self, time, command, measured):
+    def update(self, time, command, measured, position=None, goal=None):
         self.told.append((time, command, measured))
         return Answer(time, OK, self.diagnosis)
 

@@ -12,8 +12,15 @@ import numpy as np
 import pytest
 
 from failuretwin import load_robot
-from failuretwin.app.reports.arm_sketch import Mark, arm_sketch, joint_places, resting_pose
-from failuretwin.app.reports.technician_page import MOST_PICTURES, chosen_runs, write_page
+from failuretwin.app.reports.technician_page import (
+    MOST_PICTURES,
+    Mark,
+    arm_sketch,
+    chosen_runs,
+    joint_places,
+    resting_pose,
+    write_page,
+)
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, MovementEvidence, paper_hypotheses
 from failuretwin.decision.robot_state import robot_state
 from failuretwin.inference.explanation import worded

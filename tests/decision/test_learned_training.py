@@ -12,7 +12,6 @@ from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expecta
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.decision.learned.networks import (
     NETWORKS,
-    Pace,
     Shape,
     Standard,
     build_network,
@@ -42,7 +41,7 @@ def learn(name, seed=0, iterations=120):
     torch.manual_seed(seed)
     network = build_network(name, SHAPE)
     batches = shuffled_batches(features, classes, 32, np.random.default_rng(seed))
-    for _ in training(network, batches, Pace(iterations, 3e-3)):
+    for _ in training(network, batches, iterations, 3e-3):
         pass
     return network
 
@@ -89,10 +88,18 @@ def test_an_unknown_network_is_refused():
         build_network("lstms", SHAPE)
 
 
-def test_the_rate_falls_to_zero_or_stays():
-    assert [Pace(100, 0.1).rate(i) for i in (0, 99)] == [0.1, 0.1]
-    falling = [Pace(100, 0.1, decay=True).rate(i) for i in (0, 50, 100)]
-    assert falling == pytest.approx([0.1, 0.05, 0.0])
+@pytest.mark.parametrize("decay", [False, True])
+def test_the_rate_falls_to_zero_or_stays(decay):
+    """Adam moves a weight by about the rate at first, and by less later."""
+    network, (features, classes) = build_network("cnn", SHAPE), toy()
+    batches = shuffled_batches(features, classes, 32, np.random.default_rng(0))
+    weight, steps = network.dense.weight, []
+    before = weight.detach().clone()
+    for _ in training(network, batches, 40, 1e-3, decay):
+        steps.append(float((weight.detach() - before).abs().max()))
+        before = weight.detach().clone()
+    assert steps[0] == pytest.approx(1e-3, rel=0.01)
+    assert (steps[-1] < 0.02 * steps[0]) == decay
 
 
 def test_an_epoch_is_101_batches_of_the_papers_data():

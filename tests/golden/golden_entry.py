@@ -14,7 +14,7 @@ from failuretwin.connection.calibration.observations import observe
 from failuretwin.core.hypothesis import parse_hypotheses
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.decision.learned.feature_encoder import (
-    RobustFeatures,
+    FeatureEncoder,
     augmented_features,
     expectation_of,
     original_features,
@@ -73,7 +73,8 @@ def healthy(which, robot):
 
 
 def robust_features(robot, imperfections, runs):
-    return RobustFeatures(robot, expectation_of(robot, imperfections))(signals_of(runs))
+    encoder = FeatureEncoder("robust", robot, expectation_of(robot, imperfections))
+    return encoder.residuals(signals_of(runs))
 
 
 def evidence_of(diagnoser, runs):

@@ -14,14 +14,13 @@ import click
 
 from failuretwin import __version__
 from failuretwin.app.commands.act import act, reach, stop
-from failuretwin.app.commands.advise import advise
 from failuretwin.app.commands.check import check, design, isolability
 from failuretwin.app.commands.data import import_, robot, simulate
 from failuretwin.app.commands.diagnose import demo, diagnose
 from failuretwin.app.commands.doctor import doctor
-from failuretwin.app.commands.evaluate import evaluate
 from failuretwin.app.commands.learn import calibrate, study, train
 from failuretwin.app.commands.live import emulate, watch
+from failuretwin.app.commands.results import advise, evaluate
 from failuretwin.app.terminal import tell
 from failuretwin.core.errors import FailureTwinError
 

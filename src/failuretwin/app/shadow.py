@@ -25,7 +25,7 @@ from failuretwin.connection.links.statuses import UNDECIDED, is_sure, statuses
 from failuretwin.connection.links.stream_time import LiveReference, ReorderBuffer, StreamClock
 from failuretwin.core.hypothesis import CLEAR, RAISED, SUSPECTED, Alarm, Hypothesis
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
+from failuretwin.decision.streaming.diagnoser import RobotStream
 from failuretwin.decision.streaming.monitor import FaultMonitor
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.explanation import plain_name, with_reading_doubt
@@ -73,7 +73,7 @@ class Shadow:
     def __init__(
         self,
         source: Source,
-        diagnoser: StreamingDiagnoser | FaultMonitor,
+        diagnoser: RobotStream,
         twin: DigitalTwin,
         sinks: Sequence[Sink] = (),
         commands_late_s: float = 0.0,
@@ -162,21 +162,14 @@ class Shadow:
         if seen is not None:
             expected = np.full(3, np.nan) if command is None else self.twin.path(command)
             residual = seen - expected
-        answer = self._update(reading, command, seen)
+        read_at, position = self._position
+        if abs(reading.time - read_at) > TOGETHER_S:
+            position = None
+        answer = self._diagnoser.update(reading.time, command, seen, position, reading.goal)
         self._fed_s = time.monotonic()  # what we take to think is no silence of the robot
         if seen is not None:
             self._read_s = self._fed_s
         self._publish(answer, residual)
-
-    def _update(
-        self, reading: Reading, command: FloatArray | None, seen: FloatArray | None
-    ) -> Answer:
-        """Update the diagnoser with a reading, and the motor readings of the same time."""
-        at, (read_at, position) = reading.time, self._position
-        if self.monitor is None:
-            return self._diagnoser.update(at, command, seen)
-        together = abs(at - read_at) <= TOGETHER_S
-        return self.monitor.update(at, command, seen, position if together else None, reading.goal)
 
     def _publish(self, answer: Answer, residual: FloatArray) -> None:
         silent = time.monotonic() - self._read_s > SILENCE_S

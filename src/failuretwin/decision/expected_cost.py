@@ -23,10 +23,8 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Fault, Hypothesis
 from failuretwin.core.types import FloatArray
 
-CONTINUE, COMPENSATE, SLOW_DOWN, INSPECT, REPLACE, STOP = (
-    *("continue", "compensate", "slow down"),
-    *("inspect", "replace", "stop"),
-)
+CONTINUE, COMPENSATE, SLOW_DOWN = "continue", "compensate", "slow down"
+INSPECT, REPLACE, STOP = "inspect", "replace", "stop"
 ANY = "any"
 """Name of the row that stands for modes without one of their own."""
 
@@ -155,20 +153,18 @@ class Advice:
 
 def cost_of(action: str, motor: str, hypothesis: Hypothesis, costs: Costs) -> float:
     """Return C(a, h) of an action other than inspecting."""
-    faults = hypothesis.faults
     if action == STOP:
         return costs.stop
+    faults = hypothesis.faults if hypothesis.known else (Fault("", ANY),)
     if action == REPLACE:
         faults = tuple(fault for fault in faults if fault.motor != motor)
     rows = [costs.missed_by(fault) for fault in faults] or [costs.healthy]
-    if not hypothesis.known:
-        rows = [costs.missed_by(Fault("", ANY))]
-    share = {
-        COMPENSATE: max(row.compensating for row in rows),
-        SLOW_DOWN: max(row.slowly for row in rows),
-    }.get(action, max(row.going_on for row in rows))
-    price = {COMPENSATE: costs.compensate, SLOW_DOWN: costs.slow_down, REPLACE: costs.replace}
-    return price.get(action, 0.0) + costs.targets * costs.missed_target * share
+    price, share = {
+        COMPENSATE: (costs.compensate, max(row.compensating for row in rows)),
+        SLOW_DOWN: (costs.slow_down, max(row.slowly for row in rows)),
+        REPLACE: (costs.replace, max(row.going_on for row in rows)),
+    }.get(action, (0.0, max(row.going_on for row in rows)))
+    return price + costs.targets * costs.missed_target * share
 
 
 def cost_table(
@@ -219,16 +215,14 @@ def _hinge(difference: FloatArray, probability: FloatArray) -> tuple[int, float]
     Returns:
         Its index, -1 if none, and the probability.
     """
-    best, where, nearest = -1, np.nan, np.inf
-    for h, (own, p) in enumerate(zip(difference, probability, strict=True)):
-        rest = 1.0 - p
-        others = float(difference @ probability - own * p) / rest if rest > 1e-12 else 0.0
-        if own == others:
-            continue
-        t = others / (others - own)
-        if 0.0 <= t <= 1.0 and abs(t - p) < nearest:
-            best, where, nearest = h, float(t), abs(t - p)
-    return best, where
+    rest = 1.0 - probability
+    left = difference @ probability - difference * probability
+    others = np.divide(left, rest, out=np.zeros_like(rest), where=rest > 1e-12)
+    apart = others - difference
+    t = np.divide(others, apart, out=np.full_like(rest, np.nan), where=apart != 0.0)
+    away = np.where((t >= 0.0) & (t <= 1.0), np.abs(t - probability), np.inf)
+    best = int(np.argmin(away))
+    return (best, float(t[best])) if np.isfinite(away[best]) else (-1, np.nan)
 
 
 TEMPLATE = """\

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import softmax
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray, IntArray
@@ -128,8 +129,8 @@ def remaining_life(
         raise InputError("the limit and all variances must lie above 0.")
     time, mean, spread = _blocks(wear, variance)
     bank = _Filters.of(time, mean, spread, limit, float(len(wear)))
-    runs, level = bank.lifetimes(limit, float(len(wear)), rng)
-    return RemainingLife(np.sort(runs), len(wear), level, limit)
+    runs = bank.lifetimes(limit, float(time[-1]), float(len(wear)), rng)
+    return RemainingLife(np.sort(runs), len(wear), float(bank.weight @ bank.mean[:, 0]), limit)
 
 
 def _blocks(wear: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -157,86 +158,70 @@ def _shapes(time: FloatArray, now: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Filters:
-    """Kalman filters of level and rate, one for each shape and diffusion, (filter,) each.
+    """Kalman filters of level and rate (x, v), one for each shape and diffusion.
 
     Attributes:
-        shape: Which shape.
-        diffusion: q, variance of the random walk in one run.
-        level: Mean of x at the last block.
-        rate: Mean of v.
-        a: Variance of x.
-        b: Covariance of x and v.
-        c: Variance of v.
-        log_evidence: Log density of all runs, and what was believed of the shape before.
-        last: Time of the last block.
+        shape: Which shape, (filter,).
+        diffusion: q, variance of the random walk in one run, (filter,).
+        mean: Mean of (x, v) at the last block, (filter, 2).
+        spread: Covariance of that, (filter, 2, 2).
+        weight: Probability, (filter,).
     """
 
     shape: IntArray
     diffusion: FloatArray
-    level: FloatArray
-    rate: FloatArray
-    a: FloatArray
-    b: FloatArray
-    c: FloatArray
-    log_evidence: FloatArray
-    last: float
+    mean: FloatArray
+    spread: FloatArray
+    weight: FloatArray
 
     @classmethod
     def of(
-        cls, time: FloatArray, mean: FloatArray, variance: FloatArray, limit: float, now: float
+        cls, time: FloatArray, wear: FloatArray, variance: FloatArray, limit: float, now: float
     ) -> _Filters:
         """Return the filters after all blocks; a new motor begins with level 0."""
-        shapes = _shapes(np.concatenate([[0.0], time]), now)
-        count = len(shapes)
+        shapes = _shapes(np.append(0.0, time), now)
         step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-        scale = float(np.median(variance)) / step
-        shape = np.repeat(np.arange(count), len(DIFFUSIONS))
-        q = np.tile(np.array(DIFFUSIONS) * scale, count)
-        level, rate, a, b = (np.zeros(len(q)) for _ in range(4))
-        c = np.full(len(q), (FASTEST * limit / now) ** 2)
+        shape = np.repeat(np.arange(len(shapes)), len(DIFFUSIONS))
+        q = np.tile(np.array(DIFFUSIONS) * float(np.median(variance)) / step, len(shapes))
+        mean, spread = np.zeros((len(q), 2)), np.zeros((len(q), 2, 2))
+        spread[:, 1, 1] = (FASTEST * limit / now) ** 2
+        move = np.tile(np.eye(2), (len(q), 1, 1))
         log_evidence = np.where(shape == POWERS.index(1.0), np.log(STEADY), 0.0)
-        before = np.concatenate([[0.0], time])
+        walked = np.diff(time, prepend=0.0)
         for i in range(len(time)):
-            h = shapes[shape, i + 1] - shapes[shape, i]
-            level = level + h * rate
-            a = a + 2.0 * h * b + h * h * c + q * (before[i + 1] - before[i])
-            b = b + h * c
-            total = a + variance[i]
-            off = mean[i] - level
+            move[:, 0, 1] = shapes[shape, i + 1] - shapes[shape, i]
+            mean = (move @ mean[..., None])[..., 0]
+            spread = move @ spread @ move.mT
+            spread[:, 0, 0] += q * walked[i]
+            total, off = spread[:, 0, 0] + variance[i], wear[i] - mean[:, 0]
             log_evidence += -0.5 * (np.log(2.0 * np.pi * total) + off**2 / total)
-            gain, gain_rate = a / total, b / total
-            level, rate = level + gain * off, rate + gain_rate * off
-            c, b, a = c - gain_rate * b, b - gain * b, a - gain * a
-        return cls(shape, q, level, rate, a, b, c, log_evidence, float(time[-1]))
+            gain = spread[:, :, 0] / total[:, None]
+            mean = mean + gain * off[:, None]
+            spread = spread - gain[:, :, None] * spread[:, None, 0]
+        return cls(shape, q, mean, spread, np.asarray(softmax(log_evidence)))
 
     def lifetimes(
-        self, limit: float, now: float, rng: np.random.Generator
-    ) -> tuple[FloatArray, float]:
-        """Return numbers of runs left, (sample,), and the level now."""
-        weight = np.exp(self.log_evidence - self.log_evidence.max())
-        weight /= weight.sum()
-        pick = rng.choice(len(weight), SAMPLES, p=weight)
-        q, shape = self.diffusion[pick], self.shape[pick]
-        root = np.sqrt(np.maximum(self.a[pick], 1e-300))
-        cross = self.b[pick] / root
-        rest = np.sqrt(np.maximum(self.c[pick] - cross**2, 0.0))
+        self, limit: float, last: float, now: float, rng: np.random.Generator
+    ) -> FloatArray:
+        """Return numbers of runs left, (sample,); `last` is the time of the last block."""
+        pick = rng.choice(len(self.weight), SAMPLES, p=self.weight)
+        q, shape, (x, v) = self.diffusion[pick], self.shape[pick], self.mean[pick].T
+        root = np.sqrt(np.maximum(self.spread[pick, 0, 0], 1e-300))
+        cross = self.spread[pick, 0, 1] / root
+        rest = np.sqrt(np.maximum(self.spread[pick, 1, 1] - cross**2, 0.0))
         z = rng.standard_normal((2, SAMPLES))
-        x = self.level[pick] + root * z[0]
-        v = self.rate[pick] + cross * z[0] + rest * z[1]
-        level = float(weight @ self.level)
-        ahead = np.geomspace(1.0, LONGEST * now, STEPS)
-        time = np.concatenate([[self.last], now + ahead])
+        x, v = x + root * z[0], v + cross * z[0] + rest * z[1]
+        time = np.append(last, now + np.geomspace(1.0, LONGEST * now, STEPS))
         shapes = _shapes(time, now)
         ended = np.where(np.abs(x) >= limit, 0.0, np.inf)
-        for i in range(STEPS):
-            dt = time[i + 1] - time[i]
+        for i, dt in enumerate(np.diff(time).tolist()):
             drift = v * (shapes[shape, i + 1] - shapes[shape, i])
             after = x + drift + np.sqrt(q * dt) * rng.standard_normal(SAMPLES)
             hit = np.isinf(ended) & (rng.random(SAMPLES) < _crossed(x, after, limit, q * dt))
             at = time[i] + dt * rng.random(SAMPLES) - now
             ended[hit] = np.maximum(at[hit], 0.0)
             x = after
-        return ended, level
+        return ended
 
 
 def _crossed(

@@ -112,9 +112,9 @@ class RobotState:
     Attributes:
         state: The state.
         headline: The state in a few words, with motor and joint.
-        sureness: Its probability in words; empty without a verdict.
         step: The next step.
         remark: Remark on the runs as a whole, or empty.
+        posterior: Probability of each hypothesis over the runs behind the state.
         motors: State of each motor, in chain order.
         arm_class: Kind of arm, by its actuators.
         runs: Number of runs.
@@ -122,12 +122,18 @@ class RobotState:
 
     state: State
     headline: str
-    sureness: str
     step: str
-    remark: str
-    motors: tuple[MotorState, ...]
-    arm_class: str
-    runs: int
+    remark: str = ""
+    posterior: Mapping[str, float] = field(default_factory=dict)
+    motors: tuple[MotorState, ...] = ()
+    arm_class: str = ""
+    runs: int = 0
+
+    @property
+    def sureness(self) -> str:
+        """Its probability in words; empty without a verdict."""
+        chance = self.state.probability
+        return "" if chance is None else f"{sureness(chance)} ({percent(chance)})"
 
     @property
     def line(self) -> str:
@@ -153,17 +159,6 @@ def with_motors(posterior: Mapping[str, float], order: Sequence[str]) -> State:
 def state_of_run(diagnosis: Diagnosis, order: Sequence[str]) -> State:
     """Return the state of one run; it is open without a verdict."""
     return State(OPEN_STATE) if diagnosis.undecided else with_motors(diagnosis.posterior, order)
-
-
-@dataclass(frozen=True)
-class _Summary:
-    """State over all runs, with motors by their names in the profile."""
-
-    state: State
-    headline: str
-    step: str
-    remark: str = ""
-    posterior: Mapping[str, float] = field(default_factory=dict)
 
 
 def robot_state(
@@ -194,16 +189,14 @@ def robot_state(
     else:
         found = _one_by_one(diagnoses, states, decided, robot, learned is None)
     found = _with_zero(found, [*(line for d in diagnoses for line in d.quality), *(learned or ())])
-    chance = found.state.probability
-    return RobotState(
-        found.state,
-        joint_names_in(found.headline, robot),
-        "" if chance is None else f"{sureness(chance)} ({percent(chance)})",
-        joint_names_in(found.step, robot),
-        joint_names_in(found.remark, robot),
-        _motor_states(diagnoses, states, found, robot),
-        class_name(robot),
-        len(diagnoses),
+    return replace(
+        found,
+        headline=joint_names_in(found.headline, robot),
+        step=joint_names_in(found.step, robot),
+        remark=joint_names_in(found.remark, robot),
+        motors=_motor_states(diagnoses, states, found, robot),
+        arm_class=class_name(robot),
+        runs=len(diagnoses),
     )
 
 
@@ -213,7 +206,7 @@ def course_of(diagnoses: Sequence[Diagnosis], diagnoser: BayesDiagnoser) -> Faul
     return FaultCourse.of(diagnoses, prior)
 
 
-def _with_zero(found: _Summary, lines: Sequence[str]) -> _Summary:
+def _with_zero(found: RobotState, lines: Sequence[str]) -> RobotState:
     """Return an open state if a healthy one has a remark on a zero or a fault of every run."""
     remarks = [line for line in lines if FAULT_OF_EVERY_RUN in line]
     if found.state.kind != HEALTHY_STATE or not remarks:
@@ -223,19 +216,21 @@ def _with_zero(found: _Summary, lines: Sequence[str]) -> _Summary:
     return replace(found, state=State(OPEN_STATE), headline=headline, step=ZERO_STEP, remark=remark)
 
 
-def _no_verdict(diagnoses: Sequence[Diagnosis]) -> _Summary:
+def _no_verdict(diagnoses: Sequence[Diagnosis]) -> RobotState:
     """Return the summary of runs without any verdict."""
     reason = diagnoses[0].undecided
-    return _Summary(State(OPEN_STATE), f"Cannot tell, because {reason}", undecided_step(reason))
+    return RobotState(State(OPEN_STATE), f"Cannot tell, because {reason}", undecided_step(reason))
 
 
-def _of_course(course: FaultCourse, robot: Robot) -> _Summary:
+def _of_course(course: FaultCourse, robot: Robot) -> RobotState:
     """Return the state at the last run given all runs."""
     last = course.posterior[-1]
     posterior = {str(h): float(p) for h, p in zip(course.hypotheses, last, strict=True)}
     steps = " ".join(next_steps(posterior, class_name(robot)))
     state = with_motors(posterior, robot.motor_names)
-    return _Summary(state, _headline(state, posterior), steps, "; ".join(course.verdict), posterior)
+    return RobotState(
+        state, _headline(state, posterior), steps, "; ".join(course.verdict), posterior
+    )
 
 
 def _one_by_one(
@@ -244,7 +239,7 @@ def _one_by_one(
     decided: Sequence[int],
     robot: Robot,
     each_alone: bool,
-) -> _Summary:
+) -> RobotState:
     """Return the pooled state since the first faulty run, if the runs agree.
 
     `each_alone`: the runs share nothing learned, so diagnosing them together is advised.
@@ -265,7 +260,7 @@ def _one_by_one(
     step = " ".join(next_steps(posterior, class_name(robot), alone))
     if state.kind == OPEN_STATE and len(used) > 1 and each_alone:
         step = f"{step} {TOGETHER_STEP}"
-    return _Summary(state, _headline(state, posterior), step, "; ".join(remarks), posterior)
+    return RobotState(state, _headline(state, posterior), step, "; ".join(remarks), posterior)
 
 
 def _alone(diagnoses: Sequence[Diagnosis], faulty: Sequence[int], decided: int) -> str:
@@ -285,7 +280,7 @@ def _pooled(posteriors: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 def _different(
     states: Sequence[State], decided: Sequence[int], posterior: Mapping[str, float], step: str
-) -> _Summary:
+) -> RobotState:
     """Return the summary of runs with different states."""
     counts = Counter(_short(states[i]) for i in decided)
     remark = ", ".join(f"{name} in {counted(n, 'run')}" for name, n in counts.most_common())
@@ -293,7 +288,7 @@ def _different(
         m for i in decided if states[i].kind == FAULTY_STATE for m in states[i].motors
     )
     headline = "Different states in different runs"
-    return _Summary(State(OPEN_STATE, tuple(motors)), headline, step, remark, posterior)
+    return RobotState(State(OPEN_STATE, tuple(motors)), headline, step, remark, posterior)
 
 
 def _short(state: State) -> str:
@@ -315,7 +310,7 @@ def _headline(state: State, posterior: Mapping[str, float]) -> str:
 
 
 def _motor_states(
-    diagnoses: Sequence[Diagnosis], states: Sequence[State], found: _Summary, robot: Robot
+    diagnoses: Sequence[Diagnosis], states: Sequence[State], found: RobotState, robot: Robot
 ) -> tuple[MotorState, ...]:
     """Return the state of each motor; an unknown fault leaves every motor open."""
     by_run = [{} if d.undecided else motor_probabilities(d.posterior) for d in diagnoses]

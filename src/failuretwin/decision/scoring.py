@@ -54,17 +54,6 @@ def judged_truth(truth: str, hypotheses: Container[str]) -> str:
 
 
 @dataclass(frozen=True)
-class ClassScore:
-    """Scores of one class; `runs` have it as truth. Ratios of 0 / 0 are NaN."""
-
-    name: str
-    runs: int
-    precision: float
-    recall: float
-    f1: float
-
-
-@dataclass(frozen=True)
 class Scores:
     """Accuracy and log score of a set of diagnoses.
 
@@ -106,13 +95,12 @@ class Scores:
     @property
     def macro_f1(self) -> float:
         """Mean F1 of the classes that are the truth of any run, equally weighted."""
-        return float(np.mean([row.f1 for row in self.by_class() if row.runs]))
+        return float(np.mean(self.ratios[self.confusion.any(axis=1), 2]))
 
-    def by_class(self) -> list[ClassScore]:
-        """Return precision, recall and F1 of each class."""
-        runs, ratios = self.confusion.sum(axis=1).tolist(), class_ratios(self.confusion).tolist()
-        rows = zip(self.classes, runs, ratios, strict=True)
-        return [ClassScore(name, count, *ratio) for name, count, ratio in rows]
+    @property
+    def ratios(self) -> FloatArray:
+        """Precision, recall and F1 of each class, (class, 3); see `class_ratios`."""
+        return class_ratios(self.confusion)
 
 
 def class_ratios(confusion: IntArray) -> FloatArray:

@@ -89,7 +89,8 @@ class TrainingData:
         variants: Kinds of runs, equally frequent.
         engine: Simulation engine; see `Plan`.
         hypotheses: The classes; empty: the paper's.
-        modes: Fault modes by id; variants override magnitude and onset of the paper's modes.
+        modes: Fault modes by id, which other processes would not have registered; variants
+            override magnitude and onset of the paper's modes.
     """
 
     robot: Robot

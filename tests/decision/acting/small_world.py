@@ -8,9 +8,8 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Fault
 from failuretwin.decision.acting.actor import Actor
-from failuretwin.decision.acting.belief import Belief
+from failuretwin.decision.acting.belief import Belief, Judge
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault
-from failuretwin.decision.acting.judging import Judge
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import ActingSettings, Target, Task
@@ -89,7 +88,9 @@ def carry_out(world, belief, task, settings=None, steps=200, each=None, spared=N
     planner, settings = Planner(SafetyGate(robot), spared), settings or ActingSettings()
     judge = Judge(model) if judged and belief is not None else None
     belief = belief or Belief(model)
-    actor = Actor(planner, model, task, belief, world.command, settings, judge)
+    said = []
+    actor = Actor(planner, model, task, belief, world.command, settings, judge, said.append)
+    actor.said = said
     for number in range(steps):
         order = actor.next()
         if order is None:

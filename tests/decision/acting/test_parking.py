@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from small_world import SmallWorld, believed, carry_out, task_of
 
-from failuretwin.decision.acting.belief import Belief
+from failuretwin.decision.acting.belief import Belief, Judge
 from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
-from failuretwin.decision.acting.judging import Judge
 from failuretwin.decision.acting.reach import parking_place
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import Task
@@ -133,6 +132,6 @@ def test_the_posterior_finds_it_by_a_movement_that_ended_midway(model, armpi):
             Seen(command, previous, duration, 2.0 * i, 2.0 * i + 1.5, model.twin.path(pose))
         )
         previous = command
-    found = Judge(model)([window], [None])[0]
+    found = Judge(model)(window, None)
     assert str(found.best) == "motor_3:intermittent"
     assert found.probability(found.best) > 0.9

@@ -11,7 +11,7 @@ from failuretwin.connection.links.base import Order
 from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm
 from failuretwin.decision.acting.planner import Planner, Standing
-from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
+from failuretwin.decision.acting.safety import RISE_S, SafetyGate, SafetyLimits
 from failuretwin.decision.acting.task import Target
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.inverse_kinematics import usable_limits
@@ -51,7 +51,7 @@ def violations(gate, previous, order, samples=FINER):
     top = np.array([motor.speed_limit for motor in robot.motors])
     if np.any(travel / order.duration > gate.limits.speed_share * top * (1 + 1e-9)):
         found.append("speed")
-    if np.any(4 * travel / order.duration**2 > top / gate.limits.rise_s * (1 + 1e-9)):
+    if np.any(4 * travel / order.duration**2 > top / RISE_S * (1 + 1e-9)):
         found.append("acceleration")
     for share in np.linspace(0.0, 1.0, samples):
         points = lines(robot, previous + share * (order.target - previous))
@@ -180,7 +180,7 @@ def test_durations_keep_speed_and_acceleration(armpi):
         assert "acceleration" not in found
 
 
-@pytest.mark.parametrize("wrong", [{"speed_share": 0.0}, {"speed_share": 1.5}, {"rise_s": 0.0}])
+@pytest.mark.parametrize("wrong", [{"speed_share": 0.0}, {"speed_share": 1.5}])
 def test_limits_that_make_no_sense_are_refused(wrong):
     with pytest.raises(InputError):
         SafetyLimits(**wrong)

@@ -10,7 +10,8 @@ from small_world import SmallWorld, carry_out, task_of
 
 from failuretwin import InputError
 from failuretwin.app.arms import spared_of
-from failuretwin.decision.acting.planner import Standing, sparing_lines, turned_round, wear_weights
+from failuretwin.decision.acting.planner import Planner, Standing, turned_round, wear_weights
+from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
 
 
@@ -85,17 +86,17 @@ def test_a_spared_motor_does_less_at_no_loss(model, armpi, motor):
     assert len(actor.ways) == 25
     assert plain.ways == []
 
-    def mean(name, which):
-        values = [getattr(way[which], name) for way in actor.ways]
-        return float(np.mean([np.atleast_1d(v)[motor if np.ndim(v) else 0] for v in values]))
-
-    effort = [mean("load", i) + mean("travel", i) / np.pi for i in (0, 1)]
+    planner = Planner(SafetyGate(armpi), spared)
+    way_s = np.mean([planner.way_s(poses, at) for poses, at in actor.ways], axis=0)
+    load = np.mean([planner.load(poses)[:, motor] for poses, _ in actor.ways], axis=0)
+    travel = np.mean([np.abs(poses - at.pose)[:, motor] for poses, at in actor.ways], axis=0)
+    effort = load + travel / np.pi
     assert effort[0] < 0.9 * effort[1]
-    assert mean("way_s", 0) >= mean("way_s", 1)
-    lines = sparing_lines(armpi.motor_names, spared, actor.ways)
+    assert way_s[0] >= way_s[1]
+    lines = planner.sparing_lines(actor.ways)
     assert lines[0].startswith(f"motor_{motor + 1} spared (weight 1.00)")
-    assert f"load {mean('load', 0):.0%} instead of {mean('load', 1):.0%}" in lines[0]
-    assert f"{mean('way_s', 0):.2f} instead of {mean('way_s', 1):.2f}" in lines[-1]
+    assert f"load {load[0]:.0%} instead of {load[1]:.0%}" in lines[0]
+    assert f"{way_s[0]:.2f} instead of {way_s[1]:.2f}" in lines[-1]
 
 
 def test_reversals_are_seen_by_the_travel_before():

@@ -15,8 +15,7 @@ from failuretwin.connection.links.base import CommandSent, LinkCounts, Order, Re
 from failuretwin.core.errors import InputError
 from failuretwin.decision.acting import work as work_module
 from failuretwin.decision.acting.actor import Actor
-from failuretwin.decision.acting.belief import Belief
-from failuretwin.decision.acting.judging import Judge
+from failuretwin.decision.acting.belief import Belief, Judge
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError
 from failuretwin.decision.acting.task import Target, Task, read_task
@@ -33,8 +32,10 @@ from failuretwin.failure_behavior.injection import ScheduledFault
 def work_of(model, commander, task, judge=None, gate=None):
     gate = gate or SafetyGate(model.twin.robot)
     standing, said = first_standing(commander), []
-    actor = Actor(Planner(gate), model, task, Belief(model), standing, judge=judge)
-    return Work(actor, gate, commander, standing, said.append), said
+    actor = Actor(
+        Planner(gate), model, task, Belief(model), standing, judge=judge, tell=said.append
+    )
+    return Work(actor, gate, commander, standing), said
 
 
 class Fake:

@@ -13,7 +13,7 @@ from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
 from failuretwin.decision.test_motions.design import Designer
 from failuretwin.decision.test_motions.health_check import checking
 from failuretwin.decision.test_motions.motions import Motions
-from failuretwin.decision.test_motions.outlook import Asked, Member, Outlook, of_priors
+from failuretwin.decision.test_motions.outlook import Member, Outlook, of_priors
 from failuretwin.digital_model.clearance import segment_distance
 from failuretwin.failure_behavior.fault import STEP
 from failuretwin.failure_behavior.injection import Injection
@@ -21,6 +21,11 @@ from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
 COUNT_RAD = np.deg2rad(0.24)
+
+
+def movements(told, since_s):
+    """Return movements one after the other, the start first in `told`."""
+    return told[1:], told[:-1], since_s, np.arange(len(told) - 1)
 
 
 def settled_by_simulation(model, told, hypothesis, size):
@@ -57,11 +62,11 @@ def test_expected_places_are_those_of_the_simulated_fault(model, fault, size):
     told = np.deg2rad([[0, 0, 0, 0], [40, 30, -20, 35], [-30, -20, 40, -30], [10, 35, 5, 45]])
     hypothesis = Hypothesis.parse(fault)
     outlook = Outlook(model, [Member(HEALTHY, np.nan, 0.5), Member(hypothesis, size, 0.5)])
-    mean, _ = outlook.expected(Asked.of(told, 3.0 * np.arange(1, 4)))
+    mean, _ = outlook.expected(*movements(told, 3.0 * np.arange(1, 4)))
     if fault.endswith("stuck"):  # where the healthy motor settled at zero
         held = model.settle(told[:1], 0.0 * told[:1], model.none_held)[0, 1]
         members = [Member(HEALTHY, np.nan, 0.5), Member(hypothesis, held, 0.5)]
-        mean, _ = Outlook(model, members).expected(Asked.of(told, 3.0 * np.arange(1, 4)))
+        mean, _ = Outlook(model, members).expected(*movements(told, 3.0 * np.arange(1, 4)))
     seen = settled_by_simulation(model, told, hypothesis, size)
     away = np.linalg.norm(mean[:, 0] - seen, axis=-1)
     assert np.linalg.norm(mean[:, 1] - seen, axis=-1).max() < 0.0015
@@ -72,7 +77,7 @@ def test_an_error_drawn_anew_is_scatter_of_its_motor(model):
     hypothesis = Hypothesis.parse("motor_3:steady_state_error")
     outlook = Outlook(model, [Member(HEALTHY, np.nan, 0.5), Member(hypothesis, 0.05, 0.5)])
     told = np.deg2rad([[0, 0, 0, 0], [20, 30, -20, 35]])
-    mean, spread = outlook.expected(Asked.of(told, np.ones(1)))
+    mean, spread = outlook.expected(*movements(told, np.ones(1)))
     np.testing.assert_array_equal(mean[0, 0], mean[0, 1])
     pose = model.settle(told[1], np.sign(told[1]), model.none_held)
     _, jacobian = model.twin.path_and_jacobian(pose)
@@ -117,9 +122,9 @@ def test_small_errors_of_the_hardest_motor_show_more_than_in_random_movements(
     ]
     errors = Outlook(model, [Member(HEALTHY, np.nan, 0.2), *small])
     found = []
-    for movements in (designed, random):
-        told = np.array([movements[0].previous, *(m.order.target for m in movements)])
-        nats = errors.distances(Asked.of(told, np.zeros(len(movements)))).sum(axis=0)
+    for made in (designed, random):
+        told = np.array([made[0].previous, *(m.order.target for m in made)])
+        nats = errors.distances(*movements(told, np.zeros(len(made)))).sum(axis=0)
         found.append((nats + np.where(np.eye(5), np.inf, 0.0)).min())
     assert found[0] > 1.5 * found[1]
 

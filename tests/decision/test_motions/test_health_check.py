@@ -9,11 +9,12 @@ import failuretwin as ft
 from failuretwin.connection.emulated_arm import EmulatedArm, Emulation
 from failuretwin.connection.links.base import Order
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
+from failuretwin.decision.acting.belief import Judge, settled_evidence_of
 from failuretwin.decision.acting.believed_arm import Seen
-from failuretwin.decision.acting.judging import Judge, settled_evidence_of
 from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.health_check import (
     LOOSE_RAD,
+    Checking,
     CheckResult,
     checking,
     faults_at_rest,
@@ -21,7 +22,6 @@ from failuretwin.decision.test_motions.health_check import (
     motor_offsets,
 )
 from failuretwin.decision.test_motions.motions import Motions, read_motions, write_motions
-from failuretwin.decision.test_motions.session import Checking
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.injection import ScheduledFault
 from failuretwin.failure_behavior.modes import SteadyStateError
@@ -145,16 +145,15 @@ def carried_out(known, gate, designed, schedule, modes=None, further=0):
     emulation = Emulation(known.robot, known.imperfections, schedule, 3, modes or {})
     motions = Motions.of(known.robot, designed)
     with EmulatedArm(emulation) as arm:
-        check = Checking(known, gate).health_check(motions, further)
-        return check.work(arm, lambda _: None), check
+        return Checking(known, gate).carry_out(motions, further, arm, lambda _: None)
 
 
 def test_an_arm_without_a_fault_is_green(known, gate, designed):
     pytest.importorskip("mujoco")
-    result, check = carried_out(known, gate, designed, ())
+    result = carried_out(known, gate, designed, ())
     assert (result.light, result.motor) == ("green", "")
     assert result.diagnosis.quality == ()
-    assert result.movements == len(designed) == len(check.window)
+    assert result.movements == len(designed)
     assert sum(result.by_motor.values()) < 0.05
 
 
@@ -210,11 +209,11 @@ def test_further_movements_are_made_only_while_it_is_open(known, gate, designed)
     fault = ScheduledFault(Hypothesis.parse("motor_4:steady_state_error").faults[0], 0.0)
     modes = dict(MODES) | {"steady_state_error": SteadyStateError(magnitude=(0.02, 0.02))}
     emulation = (known, gate, designed[:3], (fault,), modes)
-    result, check = carried_out(*emulation, further=3)
-    assert result.further == len(check.window) - 3
+    result = carried_out(*emulation, further=3)
+    assert result.further == result.movements - 3
     assert 1 <= result.further <= 3
     assert result.light != "open" or result.further == 3
-    settled, _ = carried_out(known, gate, designed, (), further=3)
+    settled = carried_out(known, gate, designed, (), further=3)
     assert (settled.light, settled.further) == ("green", 0)
 
 

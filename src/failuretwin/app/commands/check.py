@@ -14,8 +14,7 @@ from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import show, tell, write_json
 
 if TYPE_CHECKING:
-    from failuretwin.decision.test_motions.health_check import CheckResult
-    from failuretwin.decision.test_motions.session import Checking
+    from failuretwin.decision.test_motions.health_check import Checking, CheckResult
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class MotionOptions:
     def checking(self, safety: opt.SafetyOptions, robot: opt.RobotOptions) -> Checking:
         """Return the settings of a check or a design."""
         from failuretwin.app.inputs import parse_cli_hypotheses
-        from failuretwin.decision.test_motions.session import Checking
+        from failuretwin.decision.test_motions.health_check import Checking
 
         known = robot.known
         named = parse_cli_hypotheses(self.hypotheses, known.robot)
@@ -145,7 +144,7 @@ def check(
         return
     with ExitStack() as stack:
         commander = commander_of(arm, checking.known, robot.seed, stack)
-        result = checking.health_check(planned, further).work(commander, tell)
+        result = checking.carry_out(planned, further, commander, tell)
     time, command = planned.reference()
     result = checking.shown(result, command, time)
     record = reports.check_record(result, model, planned.duration_s)

@@ -89,8 +89,10 @@ def class_table(scores: scoring.Scores) -> Table:
     return figures_table(
         ("class", "runs", "precision", "recall", "F1"),
         [
-            (row.name, str(row.runs), *(f"{v:.3f}" for v in (row.precision, row.recall, row.f1)))
-            for row in scores.by_class()
+            (name, str(runs.sum()), *(f"{ratio:.3f}" for ratio in ratios))
+            for name, runs, ratios in zip(
+                scores.classes, scores.confusion, scores.ratios, strict=True
+            )
         ],
     )
 

@@ -9,17 +9,16 @@ if there were none.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from failuretwin.connection.links.base import Order
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.belief import Belief
+from failuretwin.decision.acting.belief import Belief, Judge, Judgement
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
-from failuretwin.decision.acting.judging import Judge, Judgement
-from failuretwin.decision.acting.planner import Effort, Plan, Planner, Standing
+from failuretwin.decision.acting.planner import Plan, Planner, Standing
 from failuretwin.decision.acting.reach import parking_place
 from failuretwin.decision.acting.task import (
     DIRECTION_TOLERANCE_RAD,
@@ -71,6 +70,7 @@ class Actor:
         command: What the motors were told last, (motor,) [rad].
         settings: How it is carried out; None: the defaults.
         judge: Weighs movements in `see`; None: nothing is diagnosed there.
+        tell: Called with what is found out and done, as it happens.
     """
 
     def __init__(
@@ -82,18 +82,19 @@ class Actor:
         command: FloatArray,
         settings: ActingSettings | None = None,
         judge: Judge | None = None,
+        tell: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._planner, self.model, self._task, self._judge = planner, model, task, judge
         self.belief, self._settings = belief, settings or ActingSettings()
+        self._say = tell
         self.results: list[TargetResult] = []
-        self.said: list[str] = []
         self._command = self._previous = command
         self._order: Order | None = None
         self._time_s = self._pace_s = 0.0
         self._seen: Seen | None = None
         self._attempt = _Attempt()
         self._since_probe = 0
-        self.ways: list[tuple[Effort, ...]] = []  # as taken, and as if no motor were spared
+        self.ways: list[tuple[FloatArray, Standing]] = []  # see `Planner.sparing_lines`
         self._judgement: Judgement | None = None
         self._questions = self._settings.questions
 
@@ -125,44 +126,29 @@ class Actor:
     # What was seen.
 
     def see(self, point: FloatArray | None, start_s: float, rest_s: float) -> None:
-        """Add a movement, judge it and learn from it; see `add`."""
-        self.add(point, start_s, rest_s)
-        judge, belief = self._judge, self.belief
-        self.learn(None if judge is None else judge([belief.window], [belief.believed])[0])
-
-    def add(self, point: FloatArray | None, start_s: float, rest_s: float) -> None:
-        """Take where the tool came to rest after the last order.
+        """Learn from where the tool came to rest, and conclude the target if it is time to.
 
         Args:
             point: Where, (3,) [m]; None: it was not seen at rest.
-            start_s: When it was ordered, by the robot's clock [s].
-            rest_s: When it was seen at rest [s].
+            start_s: When the last order was given, by the robot's clock [s].
+            rest_s: When the tool was seen at rest [s].
         """
-        if self._order is None:
+        if self._order is None or self.done:
             return
         self._time_s, self._pace_s = rest_s, rest_s - start_s
-        self._seen = Seen(
-            self._command, self._previous, self._order.duration, start_s, rest_s, point
-        )
-        self.belief.add(self._seen)
-        self._attempt.movements += not self._attempt.asks
-
-    def learn(self, judgement: Judgement | None) -> None:
-        """Learn from the movement that was seen, and conclude the target if it is time to.
-
-        The judgement is of the movements in `belief.window`; None: they were not weighed.
-        """
-        seen = self._seen
-        if seen is None or self.done:
-            return
-        news = self.belief.take(seen, judgement)
+        told = self._command, self._previous, self._order.duration
+        self._seen = seen = Seen(*told, start_s, rest_s, point)
+        self.belief.add(seen)
+        judge, belief = self._judge, self.belief
+        self._judgement = None if judge is None else judge(belief.window, belief.believed)
+        news = self.belief.take(seen, self._judgement)
         if news:
             self._say(news)
             self._tell_reaction()
-        self._judgement = judgement
         if self._attempt.asks:
             self._attempt.asks, self._attempt.anew = False, True
             return
+        self._attempt.movements += 1
         error, feedback = self._error_m(seen), self._settings.feedback
         if self._attempt.movements == 1:
             self._attempt.first_error_m = error
@@ -228,7 +214,6 @@ class Actor:
                 self._previous, self._command = self._command, order.target
                 self._order = order
                 return order
-        self._judgement = None  # it holds what was seen of every arm that was judged with this one
         return None
 
     def _plans_anew(self) -> bool:
@@ -255,7 +240,7 @@ class Actor:
         if judgement.probability(judgement.best) >= LEFT_OPEN:
             return None
         gate = self._planner.gate
-        asked = (judgement.posterior, self._command, len(self.results), judgement.row)
+        asked = judgement.posterior, self._command, len(self.results)
         order = next_movement(self.model, gate, *asked)
         if order is None:
             return None
@@ -283,8 +268,7 @@ class Actor:
             return None
         attempt.pose = plan.pose
         if plan.unspared is not None:
-            poses = plan.pose, plan.unspared
-            self.ways.append(tuple(self._planner.effort(pose, at) for pose in poses))
+            self.ways.append((np.stack([plan.pose, plan.unspared]), at))
         return self._probed(plan.order, at)
 
     def _set_aside(self, at: Standing) -> None:
@@ -433,9 +417,6 @@ class Actor:
         return np.asarray(whole.solve(goal, start, arm.locked).pose[0, 0] - pose)
 
     # What is told.
-
-    def _say(self, text: str) -> None:
-        self.said.append(text)
 
     def _tell_reaction(self) -> None:
         believed = self.belief.believed

@@ -1,4 +1,4 @@
-"""What is believed of the arm that acts: latched, told by evidence that is not forgotten.
+"""What is believed of the arm that acts: what its latest movements say, latched.
 
 A reaction destroys its own evidence: a held motor that is told to stay where it stands says nothing
 any more. So a fault that was probable once is believed until movements speak against it,
@@ -14,22 +14,185 @@ believed are fitted to all movements since it began,
     o_i = J_k' S_k^-1 e_i / (J_k' S_k^-1 J_k),    o_i = rate (t_i - since) + noise
 
 with e the miss of the tool at rest, S_k its scatter by all motors.
+
+Section: docs/acting.md#how-it-works
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from failuretwin.core.hypothesis import HEALTHY, Hypothesis
+from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
+from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import HALF_90, BelievedArm, BelievedFault, Seen
-from failuretwin.decision.acting.judging import Judgement
 from failuretwin.failure_behavior.mode import Reaction, Signature
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.faults.priors import MONITORING
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.posterior import LEVELS, Posterior, compute_posterior
+from failuretwin.inference.theta.shared_posterior import shared_posterior
+
+# What the latest movements say.
+
+ACTED_ON = (
+    *("stuck", "steady_state_error", "encoder_bias", "encoder_scale"),
+    *("drift", "torque_loss", "intermittent"),
+)
+"""Modes that are told from settled positions and answered; of the others feedback, waiting and
+sending again are the whole answer, whatever they are called."""
+
+SUSPICIOUS = 0.3
+"""Probability of a fault from which it is looked at more closely."""
+RULED_OUT_NATS = 12.0
+"""What lies so far below the best is not looked at more closely [nats]."""
+
+
+def shown_faults(model: HealthyModel, modes: Iterable[str]) -> tuple[Hypothesis, ...]:
+    """Return healthy and single faults of some modes, without those that cannot show at rest.
+
+    A motor that does not give way under load shows no loss of torque there.
+    """
+    gives = dict(zip(model.motor_names, model.settling.compliance, strict=True))
+    return tuple(
+        hypothesis
+        for hypothesis in single_faults(model.motor_names, modes)
+        if all(gives[f.motor] or not MODES[f.mode].needs_compliance for f in hypothesis.faults)
+    )
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Posterior of all hypotheses on one arm over its latest movements."""
+
+    posterior: Posterior
+
+    def probability(self, hypothesis: Hypothesis) -> float:
+        """Return the probability of a hypothesis; 0 of one that was not weighed."""
+        if hypothesis not in self.posterior.hypotheses:
+            return 0.0
+        at = self.posterior.hypotheses.index(hypothesis)
+        return float(np.exp(self.posterior.log_posterior[0, at]))
+
+    @property
+    def best(self) -> Hypothesis:
+        """The most probable hypothesis."""
+        return self.posterior.hypotheses[int(np.argmax(self.posterior.log_posterior[0]))]
+
+    @property
+    def until_told_apart(self) -> tuple[Hypothesis, float]:
+        """The most probable constant error, and how probable an error of its motor is.
+
+        Whether an error is constant or drawn anew takes several movements to tell, which motor it
+        is of takes far fewer. Were it drawn anew, inverting it would do no worse than feedback.
+        """
+        single = [h for h in self.posterior.hypotheses if h.known and len(h.faults) == 1]
+        modes = {h: MODES[h.faults[0].mode] for h in single}
+        constant = [h for h in single if modes[h].reaction is Reaction.INVERT]
+        best = max(constant, key=self.probability, default=HEALTHY)
+        drawn_anew = [h for h in single if modes[h].signature is Signature.REDRAWN_OFFSET]
+        motors = {fault.motor for fault in best.faults}
+        twins = [h for h in (*constant, *drawn_anew) if h.faults[0].motor in motors]
+        return best, sum(map(self.probability, twins))
+
+    def log_evidence(self, hypothesis: Hypothesis) -> float:
+        """Return log p(movements | hypothesis)."""
+        at = self.posterior.hypotheses.index(hypothesis)
+        return float(self.posterior.log_posterior[0, at] - self.posterior.log_prior[at])
+
+    def size(self, hypothesis: Hypothesis) -> tuple[float, float]:
+        """Return median and half of the 90 % interval of the size; NaN and 0 where it has none."""
+        at = self.posterior.hypotheses.index(hypothesis)
+        size = self.posterior.weights[at].estimate(0).size
+        if size is None:
+            return np.nan, 0.0
+        low, middle, high = size.quantiles(LEVELS).tolist()
+        return middle, 0.5 * (high - low)
+
+    def onset_s(self, hypothesis: Hypothesis) -> float:
+        """Return when a fault most probably began, since the first of the movements began [s]."""
+        at = self.posterior.hypotheses.index(hypothesis)
+        onset = self.posterior.weights[at].estimate(0).onset
+        return 0.0 if onset is None else float(onset.quantiles((0.5,))[0])
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Weighs hypotheses by the latest movements of an arm.
+
+    Attributes:
+        model: The healthy robot.
+        hypotheses: What may be the case.
+    """
+
+    model: HealthyModel
+    hypotheses: Sequence[Hypothesis] = ()
+
+    def __post_init__(self) -> None:
+        if not self.hypotheses:
+            object.__setattr__(self, "hypotheses", shown_faults(self.model, ACTED_ON))
+
+    def __call__(self, window: Sequence[Seen], believed: BelievedFault | None) -> Judgement | None:
+        """Return what movements say of an arm; None where it has made none.
+
+        Doubts about an arm count as scatter first. Where that points to another fault than the one
+        believed, they are integrated out as common to all movements, which takes long.
+        """
+        if not window:
+            return None
+        likelihood = RunLikelihood(settled_evidence_of([window]), self.model)
+        rough = Judgement(compute_posterior(likelihood, self.hypotheses, MONITORING))
+        if not self._is_news(rough, believed):
+            return rough
+        log_posterior = rough.posterior.log_posterior[0]
+        near = log_posterior > log_posterior.max() - RULED_OUT_NATS
+        left = [h for h, keep in zip(self.hypotheses, near, strict=True) if keep or h.is_healthy]
+        return Judgement(shared_posterior(likelihood, left, MONITORING, False))
+
+    def _is_news(self, judgement: Judgement, believed: BelievedFault | None) -> bool:
+        """Return whether movements point to a fault that is not believed already."""
+        if self.model.imperfections.variation is None:
+            return False
+        best = judgement.best
+        if best.is_healthy or judgement.probability(best) < SUSPICIOUS:
+            return False
+        return believed is None or best.faults[0].motor != believed.fault.motor
+
+
+def settled_evidence_of(windows: Sequence[Sequence[Seen]]) -> SettledEvidence:
+    """Return movements of several arms, equally many of each, as settled evidence."""
+
+    def of_each(name: str) -> FloatArray:
+        return np.array([[getattr(seen, name) for seen in window] for window in windows])
+
+    usable = np.array([[seen.point is not None for seen in window] for window in windows])
+    nowhere = np.zeros(3)
+    point = np.array(
+        [[nowhere if seen.point is None else seen.point for seen in w] for w in windows]
+    )
+    start, rest = of_each("start_s"), of_each("rest_s")
+    zero = start[:, :1]
+    movements = Movements(
+        of_each("previous")[:, 0], of_each("command"), of_each("duration"), start - zero
+    )
+    return SettledEvidence(
+        movements=movements,
+        point=point,
+        usable=usable,
+        moving=np.zeros_like(usable),
+        begin=rest - zero,
+        end=rest - zero,
+        first_reading_delay=np.full(start.shape, np.nan),
+        arrived=np.full(movements.target.shape, np.nan),
+    )
+
+
+# What is believed.
 
 GROWTH = 1.2
 """Growth of the spread of a remembered size with each movement [-]."""

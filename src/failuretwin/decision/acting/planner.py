@@ -109,30 +109,6 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Effort:
-    """What one way asks of the arm.
-
-    Attributes:
-        way_s: Its time [s].
-        load: Load of each motor at its end, in shares of its largest, (motor,) [-].
-        travel: How far each goes, (motor,) [rad].
-        reversals: Which motors it turns round, (motor,) [-].
-    """
-
-    way_s: float
-    load: FloatArray
-    travel: FloatArray
-    reversals: FloatArray
-
-
-def _is_better(plan: Plan, other: Plan, target: Target) -> bool:
-    """Return whether a plan is the better one: safe, then near."""
-    if (plan.order is None) != (other.order is None):
-        return plan.order is not None
-    return plan.uses_up(target) < other.uses_up(target)
-
-
-@dataclass(frozen=True)
 class Planner:
     """Plans movements.
 
@@ -161,17 +137,14 @@ class Planner:
         return InverseKinematics(self.gate.robot, *self.gate.pose_limits(usual=True))
 
     def plan(self, target: Target, arm: BelievedArm, at: Standing) -> Plan:
-        """Return the best plan for a target."""
-        best: Plan | None = None
+        """Return the best plan for a target: safe, then near."""
+        plans = list[Plan]()
         for kinematics in (self.usual, self.whole):
             found = self._poses(kinematics, target, arm, at)
-            plan = self._cheapest_safe(found, target, arm, at)
-            if best is None or _is_better(plan, best, target):
-                best = plan
-            if best.order is not None and best.uses_up(target) <= NEAR_ENOUGH:
-                break
-        assert best is not None
-        return best
+            plans.append(self._cheapest_safe(found, target, arm, at))
+            if plans[-1].order is not None and plans[-1].uses_up(target) <= NEAR_ENOUGH:
+                return plans[-1]
+        return min(plans, key=lambda plan: (plan.order is None, plan.uses_up(target)))
 
     def _poses(
         self, kinematics: InverseKinematics, target: Target, arm: BelievedArm, at: Standing
@@ -251,12 +224,6 @@ class Planner:
         """Return the time of the way to poses (..., motor) [rad], (...) [s]."""
         return np.asarray(np.max(np.abs(pose - at.pose) / self.gate.speed, axis=-1))
 
-    def effort(self, pose: FloatArray, at: Standing) -> Effort:
-        """Return what the way to a pose (motor,) [rad] asks of the arm."""
-        turned = turned_round(pose, at).astype(np.float64)
-        travel = np.abs(pose - at.pose)
-        return Effort(float(self.way_s(pose, at)), self.load(pose), travel, turned)
-
     def load(self, pose: FloatArray) -> FloatArray:
         """Return the load of each motor in poses (..., motor) [rad], in shares of its largest."""
         robot = self.gate.robot
@@ -266,6 +233,29 @@ class Planner:
     def _largest_load(self) -> FloatArray:
         return np.maximum(largest_load(self.gate.robot, 0.0), 1e-9)
 
+    def sparing_lines(self, ways: Sequence[tuple[FloatArray, Standing]]) -> list[str]:
+        """Return in words what sparing has changed.
+
+        Args:
+            ways: For each, the pose as it was taken and as it would have been, (2, motor) [rad],
+                and where the arm stood.
+        """
+        if self.spared is None or not ways:
+            return []
+        taken, plain = np.mean([self.way_s(poses, at) for poses, at in ways], axis=0)
+        load = np.mean([self.load(poses) for poses, _ in ways], axis=0)
+        travel = np.mean([np.abs(poses - at.pose) for poses, at in ways], axis=0)
+        turned = np.mean([turned_round(poses, at) for poses, at in ways], axis=0)
+        lines = [
+            f"{self.gate.robot.motor_names[k]} spared (weight {self.spared[k]:.2f}): load "
+            f"{load[0, k]:.0%} instead of {load[1, k]:.0%} of its largest, {travel[0, k]:.2f} "
+            f"instead of {travel[1, k]:.2f} rad a target, turned round in {turned[0, k]:.0%} "
+            f"instead of {turned[1, k]:.0%}"
+            for k in np.flatnonzero(self.spared).tolist()
+        ]
+        cost = f"{taken - plain:+.2f} s a target ({taken:.2f} instead of {plain:.2f})"
+        return [*lines, f"which costs {cost}"]
+
 
 def turned_round(pose: FloatArray, at: Standing) -> BoolArray:
     """Return which motors go back on the way to poses (..., motor) [rad], (..., motor)."""
@@ -274,7 +264,7 @@ def turned_round(pose: FloatArray, at: Standing) -> BoolArray:
     return np.asarray((pose - at.pose) * at.travel < 0.0)
 
 
-# How worn motors are, and what sparing them costs.
+# How worn motors are.
 
 TRACKED = ("bias", "compliance", "friction")
 """What a history follows of each motor, in the order of `wear_unit`."""
@@ -315,35 +305,3 @@ def _change(rows: Sequence[Mapping[str, Any]], suffix: str) -> FloatArray:
         for row in (rows[0], rows[-1])
     )
     return np.asarray(np.hypot(first, last) if suffix else last - first)
-
-
-def sparing_lines(
-    names: Sequence[str], spared: FloatArray, ways: Sequence[tuple[Effort, ...]]
-) -> list[str]:
-    """Return in words what sparing has changed.
-
-    Args:
-        names: Names of the motors.
-        spared: Weight of each, (motor,).
-        ways: Each way as it was taken, and as it would have been.
-    """
-    if not ways:
-        return []
-
-    def both(name: str, motor: int | None = None) -> list[float]:
-        values = np.array([[getattr(effort, name) for effort in way] for way in ways])
-        return np.asarray((values if motor is None else values[..., motor]).mean(axis=0)).tolist()
-
-    taken, plain = both("way_s")
-    lines = []
-    for k in np.flatnonzero(spared).tolist():
-        load, travel, reversals = (both(name, k) for name in ("load", "travel", "reversals"))
-        lines.append(
-            f"{names[k]} spared (weight {spared[k]:.2f}): load {load[0]:.0%} instead of "
-            f"{load[1]:.0%} of its largest, {travel[0]:.2f} instead of {travel[1]:.2f} rad a "
-            f"target, turned round in {reversals[0]:.0%} instead of {reversals[1]:.0%}"
-        )
-    return [
-        *lines,
-        f"which costs {taken - plain:+.2f} s a target ({taken:.2f} instead of {plain:.2f})",
-    ]

@@ -5,7 +5,7 @@ share(k, phi) = share of points with min over q, q_k = phi, of |tool(q) - point|
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.decision.acting.safety import SafetyGate
-from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, TOLERANCE_M, Target, Task
+from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target, Task
 from failuretwin.digital_model.inverse_kinematics import (
     STARTS,
     InverseKinematics,
@@ -137,39 +137,26 @@ def reach(
     """
     gate = arm if isinstance(arm, SafetyGate) else SafetyGate(load_robot(arm))
     robot = gate.robot
-    kinematics, rng = InverseKinematics.of(robot), np.random.default_rng(seed)
-    if isinstance(points, Task):
-        where = np.array([target.point for target in points.targets])
-        tolerance = np.array([target.tolerance_m for target in points.targets])
-    else:
-        where, tolerance = points, np.full(len(points), TOLERANCE_M)
-    locked = None
-    start = kinematics.starts(STARTS, rng)
+    kinematics, locked = InverseKinematics.of(robot), None
+    start = kinematics.starts(STARTS, np.random.default_rng(seed))
     if held is not None:
         locked = np.array([name == held[0] for name in robot.motor_names])
         if not locked.any():
             raise InputError(f"robot {robot.name!r} has no motor {held[0]!r}.")
         start[:, locked] = held[1]
-    miss = np.empty(len(where))
-    for rows, direction in _by_direction(points, len(where)):
-        found = kinematics.solve(where[rows], start, locked, direction)
-        allowed = gate.clearance.margin(found.pose) >= 0.0
-        allowed &= found.miss_rad <= DIRECTION_TOLERANCE_RAD
-        miss[rows] = np.where(allowed, found.miss_m, np.inf).min(axis=1)
+    targets = (points if isinstance(points, Task) else Task.of_points(points)).targets
+    where = np.array([target.point for target in targets])
+    tolerance = np.array([target.tolerance_m for target in targets])
+    axes = {k: target.axis for k, target in enumerate(targets) if target.axis is not None}
+    free, miss = [k for k in range(len(targets)) if k not in axes], np.empty(len(targets))
+    for rows, axis in ((free, None), (list(axes), np.array(list(axes.values())))):
+        if rows:
+            found = kinematics.solve(where[rows], start, locked, axis)
+            allowed = gate.clearance.margin(found.pose) >= 0.0
+            allowed &= found.miss_rad <= DIRECTION_TOLERANCE_RAD
+            miss[rows] = np.where(allowed, found.miss_m, np.inf).min(axis=1)
     name, angle = held if held is not None else ("", np.nan)
     return Reach(name, angle, where, miss, tolerance)
-
-
-def _by_direction(
-    points: FloatArray | Task, count: int
-) -> Iterator[tuple[IntArray, FloatArray | None]]:
-    """Yield which points have no approach direction, and which have one, (point, 3)."""
-    axes = [t.axis for t in points.targets] if isinstance(points, Task) else [None] * count
-    directed = np.array([axis is not None for axis in axes])
-    if not directed.all():
-        yield np.flatnonzero(~directed), None
-    if directed.any():
-        yield np.flatnonzero(directed), np.array([axis for axis in axes if axis is not None])
 
 
 def reach_by_motor(

@@ -26,6 +26,10 @@ from failuretwin.digital_model.robot import Robot
 STEP_RAD = 0.02
 """Poses of a way are looked at so close to each other, travels of all motors added up [rad]."""
 ROUNDING = 1e-9
+RISE_S = 0.2
+"""Time that a motor needs from rest to its speed limit [s]; with it acceleration."""
+LEAST_RAMP_S = 0.4
+"""Shortest ramp [s]."""
 
 Way = tuple[FloatArray, FloatArray]
 """Pose at the start and at the end, (motor,) [rad]."""
@@ -41,15 +45,11 @@ class SafetyLimits:
 
     Attributes:
         speed_share: Share of each motor's speed limit that may be used.
-        rise_s: A motor needs so long from rest to its speed limit [s]; with it acceleration.
-        least_ramp_s: Shortest ramp [s].
         radius_m: Radius of the links [m]; None: by the reach.
         floor_m: Height of the floor in the base frame [m]; None: that of the base.
     """
 
     speed_share: float = 0.5
-    rise_s: float = 0.2
-    least_ramp_s: float = 0.4
     radius_m: float | None = None
     floor_m: float | None = None
 
@@ -58,8 +58,6 @@ class SafetyLimits:
             raise InputError(
                 f"speed_share is {self.speed_share:g}, expected a share above 0, 1 at most."
             )
-        if not (self.rise_s > 0.0 and self.least_ramp_s > 0.0):
-            raise InputError("rise_s and least_ramp_s are times above 0 [s].")
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ class SafetyGate:
     def acceleration(self) -> FloatArray:
         """Largest acceleration of each motor, (motor,) [rad/s2]."""
         own = np.array([motor.speed_limit for motor in self.robot.motors])
-        return np.asarray(own / self.limits.rise_s)
+        return np.asarray(own / RISE_S)
 
     def pose_limits(self, usual: bool) -> tuple[FloatArray, FloatArray]:
         """Return lowest and highest pose, (motor,) [rad]: of the joints, or of usual movements."""
@@ -109,7 +107,7 @@ class SafetyGate:
 
         By constant speed, and by an acceleration up to the middle and down again.
         """
-        return max(float(self._needed_s(travel).max()) * (1.0 + 1e-6), self.limits.least_ramp_s)
+        return max(float(self._needed_s(travel).max()) * (1.0 + 1e-6), LEAST_RAMP_S)
 
     def _needed_s(self, travel: FloatArray) -> FloatArray:
         """Return the shortest time of each motor for its travel, (motor,) [s]."""

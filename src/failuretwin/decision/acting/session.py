@@ -12,10 +12,9 @@ from failuretwin.connection.links.base import Commander
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.actor import Actor
-from failuretwin.decision.acting.belief import Belief
+from failuretwin.decision.acting.belief import Belief, Judge
 from failuretwin.decision.acting.believed_arm import BelievedArm
-from failuretwin.decision.acting.judging import Judge
-from failuretwin.decision.acting.planner import Plan, Planner, Standing, sparing_lines, wear_weights
+from failuretwin.decision.acting.planner import Plan, Planner, Standing, wear_weights
 from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
 from failuretwin.decision.acting.task import ActingSettings, TargetResult, Task
 from failuretwin.decision.acting.work import Work, first_standing, would_order
@@ -65,23 +64,22 @@ class Acting:
         """What plans."""
         return Planner(self.gate, self.spared, self.seed)
 
-    def actor(self, task: Task, standing: FloatArray) -> Actor:
+    def actor(self, task: Task, standing: FloatArray, tell: Callable[[str], None]) -> Actor:
         """Return what carries out a task on an arm that stands somewhere, (motor,) [rad]."""
         model = self.model
         judge = Judge(model) if self.strategy == DIAGNOSE else None
         settings = replace(self.settings, feedback=self.strategy != OPEN)
-        return Actor(self.planner, model, task, Belief(model), standing, settings, judge)
+        return Actor(self.planner, model, task, Belief(model), standing, settings, judge, tell)
 
     def work(
         self, task: Task, commander: Commander, tell: Callable[[str], None]
     ) -> Sequence[TargetResult]:
         """Carry a task out on an arm and return what became of each target."""
         standing = first_standing(commander)
-        actor = self.actor(task, standing)
-        Work(actor, self.gate, commander, standing, tell).carry_out()
-        if self.spared is not None:
-            for line in sparing_lines(self.known.robot.motor_names, self.spared, actor.ways):
-                tell(line)
+        actor = self.actor(task, standing, tell)
+        Work(actor, self.gate, commander, standing).carry_out()
+        for line in self.planner.sparing_lines(actor.ways):
+            tell(line)
         return actor.results
 
     def dry_run(

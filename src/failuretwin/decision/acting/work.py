@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -54,11 +54,6 @@ class Worker(Protocol):
     model: HealthyModel
     """The healthy arm."""
 
-    @property
-    def said(self) -> Sequence[str]:
-        """Messages so far."""
-        ...
-
     def standing(self) -> Standing:
         """Return the believed position of the arm."""
         ...
@@ -80,14 +75,12 @@ class OrderSequence:
         model: The healthy arm.
         command: Last command, (motor,) [rad].
         orders: The orders; advanced after the movement before was seen.
-        said: Messages so far.
         seen: Movements so far.
     """
 
     model: HealthyModel
     command: FloatArray
     orders: Iterator[Order]
-    said: list[str] = field(default_factory=list)
     seen: list[Seen] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -177,7 +170,6 @@ class Work:
         gate: Looks at each order again before it is sent.
         commander: The arm.
         standing: What its motors were told last, (motor,) [rad].
-        tell: Called with what is said, as it happens.
         hear: Called with each event before it counts; None: nothing came just now.
     """
 
@@ -185,7 +177,6 @@ class Work:
     gate: SafetyGate
     commander: Commander
     standing: FloatArray
-    tell: Callable[[str], None]
     hear: Callable[[Event | None], object] = lambda event: None
 
     def __post_init__(self) -> None:
@@ -193,7 +184,6 @@ class Work:
         self._heard = time.monotonic()
         self._point: FloatArray | None = None
         self._sent: list[tuple[FloatArray, FloatArray]] = []
-        self._told = 0
 
     def carry_out(self) -> None:
         """Carry the task out.
@@ -203,18 +193,10 @@ class Work:
             UnsafeOrderError: If an order must not be sent.
         """
         while (order := self.actor.next()) is not None:
-            self._report()
             self._send(order)
             start = self._now
             point = self._rest(order, start)
             self.actor.see(point, start, self._now)
-            self._report()
-        self._report()
-
-    def _report(self) -> None:
-        for text in self.actor.said[self._told :]:
-            self.tell(text)
-        self._told = len(self.actor.said)
 
     # Sending.
 

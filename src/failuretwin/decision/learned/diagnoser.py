@@ -31,7 +31,6 @@ from failuretwin.decision.learned.feature_encoder import (
 from failuretwin.decision.learned.log_pool import PoolWeights
 from failuretwin.decision.learned.networks import (
     Batch,
-    Pace,
     Shape,
     Standard,
     build_network,
@@ -107,12 +106,8 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         features = _points(features)
         rng = check_random_state(self.random_state)
         order = np.random.default_rng(rng.randint(2**31))
-        standard = Standard.of(features)
-        batches = shuffled_batches(
-            standard(features), index.astype(np.int64), self.batch_runs, order
-        )
-        self._learn(batches, standard, names, rng.randint(2**31))
-        return self
+        batches = shuffled_batches(features, index.astype(np.int64), self.batch_runs, order)
+        return self._learn(batches, Standard.of(features), names, rng.randint(2**31))
 
     def fit_batches(
         self,
@@ -129,9 +124,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """
         seed = check_random_state(self.random_state).randint(2**31)
         self.n_features_in_, self.movements_ = POINTS, movements
-        standardised = ((standard(features), index) for features, index in batches)
-        self._learn(standardised, standard, np.array(classes), seed, on_iteration)
-        return self
+        return self._learn(batches, standard, np.array(classes), seed, on_iteration)
 
     def _learn(
         self,
@@ -140,7 +133,8 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         classes: NDArray[Any],
         seed: int,
         on_iteration: Callable[[int], None] = lambda done: None,
-    ) -> None:
+    ) -> LearnedDiagnoser:
+        """Train on batches that are not standardised yet."""
         if self.iterations < 1 or self.batch_runs < 1:
             raise InputError(
                 f"{self.iterations} iterations of {self.batch_runs} runs. Expected one at least of "
@@ -151,12 +145,14 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             network = build_network(
                 self.network, network_shape(self.encoder, len(standard.mean), len(classes))
             )
-            pace = Pace(self.iterations, self.learning_rate, self.decay)
-            for done in training(network, batches, pace):
+            standardised = ((standard(features), index) for features, index in batches)
+            how = self.iterations, self.learning_rate, self.decay
+            for done in training(network, standardised, *how):
                 on_iteration(done)
         self.network_ = network.cpu()
         self.classes_, self.standard_, self.temperature_ = classes, standard, 1.0
         self.weights_: PoolWeights | None = None
+        return self
 
     def calibrate(self, X: Runs, y: ArrayLike | None = None) -> LearnedDiagnoser:
         """Set the temperature with the best mean log score on held-out runs; no test set.

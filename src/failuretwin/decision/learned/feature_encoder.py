@@ -142,50 +142,6 @@ def expectation_of(robot: Robot, imperfections: Imperfections) -> Expectation:
     return Expectation(imperfections.name, imperfections.protocol, lag, settling)
 
 
-@dataclass(frozen=True)
-class RobustFeatures:
-    """Residuals in motor space against the expected healthy arm, at 100 points of a run."""
-
-    robot: Robot
-    expected: Expectation
-
-    def __post_init__(self) -> None:
-        sliding = [joint.name for joint in self.robot.chain.joints if joint.prismatic]
-        if sliding:
-            raise InputError(
-                f"robust features know joints that turn, and {', '.join(sliding)} of "
-                f"{self.robot.name!r} slides. Use another method."
-            )
-
-    def __call__(self, signals: Signals) -> FloatArray:
-        """Return the features, (run, point, channel), of order one."""
-        index, seen = _points(signals)
-        run, known = np.arange(len(index))[:, None], seen[..., None]
-        pose = self._healthy_pose(signals, index)
-        rotation, point = self.robot.chain.frames(pose * self.robot.sensor_sense)
-        origin, axis, tool = point[..., :-1, :], rotation[..., :-1, :, 2], point[..., -1, :]
-        measured = np.where(known, signals.measured[run, index], tool)
-        turn, misfit = _explained(origin, axis, tool, measured)
-        turn = turn * self.robot.sensor_sense
-        off = _compressed(measured - tool, DISTANCE_M) * known
-        turned, left = _compressed(turn, TURN_RAD), _compressed(misfit, DISTANCE_M)
-        where = (turned * known, left * known, (pose + turn) * known, pose)
-        per_motor = np.stack(where, axis=-1)
-        return np.concatenate([per_motor.reshape(*pose.shape[:2], -1), off, known], axis=-1)
-
-    def _healthy_pose(self, signals: Signals, index: IntArray) -> FloatArray:
-        """Return the pose of a healthy arm at samples `index`, (run, point, motor) [rad]."""
-        command, lag = signals.command, np.asarray(self.expected.lag_s)
-        place = np.maximum(index[..., None] - lag / signals.step, 0.0)
-        low = place.astype(np.int64)
-        high = np.minimum(low + 1, command.shape[1] - 1)
-        run, motor = np.arange(len(index))[:, None, None], np.arange(command.shape[2])
-        before, after = command[run, low, motor], command[run, high, motor]
-        pose = before + (place - low) * (after - before)
-        direction = _direction(command)[run, low, motor]
-        return pose + self.expected.settling.offset(self.robot, pose, direction)
-
-
 def _points(signals: Signals) -> tuple[IntArray, FloatArray]:
     """Return the sample index of each point and 1 where it is a reading, else 0; (run, point).
 
@@ -255,21 +211,55 @@ class FeatureEncoder:
     def __post_init__(self) -> None:
         if self.features not in FEATURE_SETS:
             raise unknown_name("feature set", self.features, FEATURE_SETS)
+        sliding = [joint.name for joint in self.robot.chain.joints if joint.prismatic]
+        if sliding and self.features == "robust":
+            raise InputError(
+                f"robust features know joints that turn, and {', '.join(sliding)} of "
+                f"{self.robot.name!r} slides. Use another method."
+            )
 
     @property
     def protocol(self) -> str:
         """Protocol letter of the features."""
         return "P0" if self.expected is None else self.expected.protocol
 
+    @cached_property
+    def healthy(self) -> Expectation:
+        """Healthy behaviour that the robust features expect."""
+        return self.expected or expectation_of(self.robot, NO_IMPERFECTIONS)
+
     def encode(self, signals: Signals) -> Floats:
         """Return features (run, point, channel)."""
         if self.features == "robust":
-            return self._robust(signals).astype(np.float32)
+            return self.residuals(signals).astype(np.float32)
         if self.features == "original":
             return original_features(signals).astype(np.float32)
         return augmented_features(DigitalTwin(self.robot), signals).astype(np.float32)
 
-    @cached_property
-    def _robust(self) -> RobustFeatures:
-        expected = self.expected or expectation_of(self.robot, NO_IMPERFECTIONS)
-        return RobustFeatures(self.robot, expected)
+    def residuals(self, signals: Signals) -> FloatArray:
+        """Return residuals in motor space, the robust features, (run, point, channel)."""
+        index, seen = _points(signals)
+        run, known = np.arange(len(index))[:, None], seen[..., None]
+        pose = self._healthy_pose(signals, index)
+        rotation, point = self.robot.chain.frames(pose * self.robot.sensor_sense)
+        origin, axis, tool = point[..., :-1, :], rotation[..., :-1, :, 2], point[..., -1, :]
+        measured = np.where(known, signals.measured[run, index], tool)
+        turn, misfit = _explained(origin, axis, tool, measured)
+        turn = turn * self.robot.sensor_sense
+        off = _compressed(measured - tool, DISTANCE_M) * known
+        turned, left = _compressed(turn, TURN_RAD), _compressed(misfit, DISTANCE_M)
+        where = (turned * known, left * known, (pose + turn) * known, pose)
+        per_motor = np.stack(where, axis=-1)
+        return np.concatenate([per_motor.reshape(*pose.shape[:2], -1), off, known], axis=-1)
+
+    def _healthy_pose(self, signals: Signals, index: IntArray) -> FloatArray:
+        """Return the pose of a healthy arm at samples `index`, (run, point, motor) [rad]."""
+        command, lag = signals.command, np.asarray(self.healthy.lag_s)
+        place = np.maximum(index[..., None] - lag / signals.step, 0.0)
+        low = place.astype(np.int64)
+        high = np.minimum(low + 1, command.shape[1] - 1)
+        run, motor = np.arange(len(index))[:, None, None], np.arange(command.shape[2])
+        before, after = command[run, low, motor], command[run, high, motor]
+        pose = before + (place - low) * (after - before)
+        direction = _direction(command)[run, low, motor]
+        return pose + self.healthy.settling.offset(self.robot, pose, direction)

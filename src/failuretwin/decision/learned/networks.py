@@ -5,14 +5,15 @@ Each maps standardised features (run, point, channel) to logits (run, class).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import ConstantLR, CosineAnnealingLR
 
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray, IntArray
@@ -168,51 +169,31 @@ EVALUATED_RUNS = 512
 """Runs evaluated at a time."""
 
 
-@dataclass(frozen=True)
-class Pace:
-    """Settings of Adam with cross-entropy loss.
+def training(
+    network: nn.Module,
+    batches: Iterable[Batch],
+    iterations: int,
+    learning_rate: float = 1e-3,
+    decay: bool = False,
+) -> Iterator[int]:
+    """Train a network in place by Adam with cross-entropy loss, on a GPU if there is one.
 
-    Attributes:
-        iterations: Number of batches.
-        learning_rate: Initial learning rate.
-        decay: Whether the rate falls to zero along half a cosine.
+    With `decay` the learning rate falls to zero along half a cosine. Yields the number of
+    iterations after each; needs at least as many batches.
     """
-
-    iterations: int
-    learning_rate: float = 1e-3
-    decay: bool = False
-
-    def rate(self, done: int) -> float:
-        """Return the learning rate after some iterations."""
-        share = 0.5 * (1.0 + math.cos(math.pi * done / self.iterations)) if self.decay else 1.0
-        return self.learning_rate * share
-
-
-def device() -> torch.device:
-    """Return the training device: a GPU if there is one."""
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-
-
-def training(network: nn.Module, batches: Iterable[Batch], pace: Pace) -> Iterator[int]:
-    """Train a network in place; yield the number of iterations after each.
-
-    Needs at least as many batches as `pace` has iterations.
-    """
-    where = device()
+    where = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network.to(where)
-    optimizer = torch.optim.Adam(network.parameters(), lr=pace.learning_rate)
+    optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate)
+    schedule = CosineAnnealingLR(optimizer, iterations) if decay else ConstantLR(optimizer, 1.0)
     measure = nn.CrossEntropyLoss()
-    source = iter(batches)
-    for done in range(pace.iterations):
-        features, classes = next(source)
-        optimizer.param_groups[0]["lr"] = pace.rate(done)
+    for done, (features, classes) in enumerate(islice(batches, iterations), start=1):
         network.train()
         optimizer.zero_grad()
         scores = network(torch.from_numpy(features).to(where))
-        loss = measure(scores, torch.from_numpy(classes).to(where))
-        loss.backward()
+        measure(scores, torch.from_numpy(classes).to(where)).backward()
         optimizer.step()
-        yield done + 1
+        schedule.step()
+        yield done
 
 
 def scores_of(network: nn.Module, features: Floats) -> FloatArray:

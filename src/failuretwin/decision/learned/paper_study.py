@@ -249,8 +249,7 @@ def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
     batches = networks.shuffled_batches(*sets["training"], BATCH_RUNS, rng)
     accuracies: dict[str, tuple[float, ...]] = dict.fromkeys(sets, ())
     confusion = np.zeros((classes, classes), dtype=np.int64)
-    pace = networks.Pace(plan.iterations, job.learning_rate)
-    for iteration in networks.training(network, batches, pace):
+    for iteration in networks.training(network, batches, plan.iterations, job.learning_rate):
         if iteration in plan.checkpoints:
             for name, (features, truth) in sets.items():
                 diagnosis = networks.scores_of(network, features).argmax(axis=1)

@@ -35,12 +35,10 @@ from failuretwin.decision.learned.feature_encoder import (
     TURN_RAD,
     Expectation,
     FeatureEncoder,
-    expectation_of,
 )
 from failuretwin.decision.learned.log_pool import PoolWeights
 from failuretwin.decision.learned.networks import STRIDES, Standard, build_network
 from failuretwin.digital_model.kinematics import GRAVITY
-from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.digital_model.robot import Robot, load_robot
 
 FORMAT = 1
@@ -277,8 +275,7 @@ def export_numpy(diagnoser: LearnedDiagnoser, path: Path) -> None:
 def _feature_constants(encoder: FeatureEncoder) -> Arrays:
     """Return the constants of the robot and its healthy behavior that features depend on."""
     robot = encoder.robot
-    expected = encoder.expected or expectation_of(robot, NO_IMPERFECTIONS)
-    settling = expected.settling
+    settling = encoder.healthy.settling
     numbers: dict[str, Any] = {
         "joints": [joint.T_pj for joint in robot.chain.joints],
         "tool": robot.chain.T_jt[:3, 3],
@@ -291,7 +288,7 @@ def _feature_constants(encoder: FeatureEncoder) -> Arrays:
         "bias": settling.bias,
         "compliance": settling.compliance,
         "friction": settling.friction,
-        "lag": expected.lag_s,
+        "lag": encoder.healthy.lag_s,
         "turn": TURN_RAD,
         "distance": DISTANCE_M,
         "damping": DAMPING_M,

@@ -17,7 +17,7 @@ Section: docs/inference.md#streams
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import expit
@@ -96,46 +96,31 @@ class AlarmRule:
             posterior: Probability of each hypothesis, (hypothesis,).
             concluded_h: Hours of the movements that were concluded since the last call [h].
         """
-        faulty = posterior[1:]
+        faulty, last = posterior[1:], self.alarm.episode
         total = float(faulty.sum())
-        above = float(np.log(max(total, 1e-300)) - np.log(max(posterior[0], 1e-300)))
-        above -= self.log_odds
+        odds = np.maximum([total, posterior[0]], 1e-300)
+        above = float(np.log(odds[0] / odds[1])) - self.log_odds
         cause = self.hypotheses[1 + int(np.argmax(faulty))]
         named = float(faulty.max()) >= NAMED * total
-        if self.alarm.state == RAISED:
-            self._while_raised(time, above, cause, named)
-        else:
-            self._while_not(time, above, cause, named, concluded_h)
-        return self.alarm
-
-    def _while_raised(self, time: float, above: float, cause: str, named: bool) -> None:
-        episode = self.alarm.episode
-        assert episode is not None
-        if above < -np.log(SUSPICION):
-            over = Episode(episode.number, episode.cause, episode.raised_s, time)
-            self.alarm = Alarm(CLEAR, "", over)
-        elif named and cause != episode.cause and above >= 0.0:
-            self._raise(episode.number + 1, cause, time)
-
-    def _while_not(
-        self, time: float, above: float, cause: str, named: bool, concluded_h: float
-    ) -> None:
-        last = self.alarm.episode
+        if self.alarm.state == RAISED and last is not None:
+            if above < -np.log(SUSPICION):
+                self.alarm = Alarm(CLEAR, "", replace(last, cleared_s=time))
+            elif named and cause != last.cause and above >= 0.0:
+                self._raise(last.number + 1, cause, time)
+            return self.alarm
         self.hours += concluded_h
-        self._unnamed += above >= 0.0 and concluded_h > 0.0
-        if above < 0.0:
-            self._unnamed = 0
+        self._unnamed = self._unnamed + (concluded_h > 0.0) if above >= 0.0 else 0
         if above >= 0.0 and (named or self._unnamed >= PATIENCE):
             self._raise(1 if last is None else last.number + 1, cause, time)
-            self._unnamed = 0
         elif above >= -np.log(SUSPICION):
             self.alarm = Alarm(SUSPECTED, cause, last)
         elif self.alarm.state != CLEAR:
             self.passed += 1
             self.alarm = Alarm(CLEAR, "", last)
+        return self.alarm
 
     def _raise(self, number: int, cause: str, time: float) -> None:
-        threshold = float(expit(self.log_odds))
+        self._unnamed, threshold = 0, float(expit(self.log_odds))
         self.alarm = Alarm(RAISED, cause, Episode(number, cause, time), threshold)
 
 

@@ -110,7 +110,65 @@ def _mismatch(header: dict[str, Any], diagnoser: BayesDiagnoser, robots: int | N
     return ""
 
 
-class StreamingDiagnoser:
+class RobotStream:
+    """A stream of one robot: an answer at every sample.
+
+    Args:
+        fleet: What its movements say; a fleet of one.
+    """
+
+    def __init__(self, fleet: StreamingFleet) -> None:
+        self._fleet = fleet
+        self._diagnosis: Diagnosis | None = None
+
+    def update(
+        self,
+        time: float,
+        command: Mapping[str, float] | ArrayLike | None,
+        measured: ArrayLike | None,
+        position: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
+    ) -> Answer:
+        """Take what is known at a time and return what is believed then.
+
+        Args:
+            time: Time of the stream [s]; a sample may come late, as long as its movement lasts.
+            command: Reference of every motor, by name or (motor,) [rad]; None: not known.
+            measured: Tool position, (axis,) [m]; None or NaN: no reading.
+            position: What the motors report of themselves, (motor,) [rad], where that is believed.
+            goal: Goals that they report to have received, (motor,) [rad], where these are believed.
+
+        Raises:
+            InputError: If a motor is missing, shapes do not fit or the time is not finite.
+        """
+        reference = reference_of(self._fleet.diagnoser.twin.robot.motor_names, command)
+        point = None if measured is None else as_floats(measured)
+        if len(self._fleet.update(time, *map(row_of, (reference, point, position, goal)))):
+            self._judge()
+        self._watch(time, reference, point)
+        return self._answer()
+
+    def conclude(self) -> Answer:
+        """Count all that has come, as if the stream were over: the answer of the batch method."""
+        self._fleet.conclude()
+        self._judge()
+        return self._answer()
+
+    def _judge(self) -> None:
+        """Renew the diagnosis by what the last movements say."""
+        found = self._fleet.diagnosis(0, self._diagnosis)
+        self._diagnosis = None if found is None else replace(found, run="stream")
+
+    def _watch(self, time: float, reference: FloatArray | None, point: FloatArray | None) -> None:
+        """Take a sample for what is watched in addition to the motors: nothing."""
+
+    def _answer(self) -> Answer:
+        """Return what is believed."""
+        state = STALE if self._fleet.stale[0] else OK
+        return Answer(self._fleet.time, state, self._diagnosis)
+
+
+class StreamingDiagnoser(RobotStream):
     """Streaming diagnosis of one robot; see `StreamingFleet` for what counts when.
 
     Args:
@@ -126,36 +184,7 @@ class StreamingDiagnoser:
         rate_hz: float | None = None,
         movements: int = MOVEMENTS,
     ) -> None:
-        self._fleet = StreamingFleet(diagnoser, 1, rate_hz, movements)
-        self._motors = self._fleet.diagnoser.twin.robot.motor_names
-        self._diagnosis: Diagnosis | None = None
-
-    def update(
-        self,
-        time: float,
-        command: Mapping[str, float] | ArrayLike | None,
-        measured: ArrayLike | None,
-    ) -> Answer:
-        """Take what is known at a time and return what is believed then.
-
-        Args:
-            time: Time of the stream [s]; a sample may come late, as long as its movement lasts.
-            command: Reference of every motor, by name or (motor,) [rad]; None: not known.
-            measured: Tool position, (axis,) [m]; None or NaN: no reading.
-
-        Raises:
-            InputError: If a motor is missing, shapes do not fit or the time is not finite.
-        """
-        reference = reference_of(self._motors, command)
-        if len(self._fleet.update(time, *map(row_of, (reference, measured)))):
-            self._diagnosis = self._told()
-        return self._answer()
-
-    def conclude(self) -> Answer:
-        """Count all that has come and return the answer of the batch method."""
-        self._fleet.conclude()
-        self._diagnosis = self._told()
-        return self._answer()
+        super().__init__(StreamingFleet(diagnoser, 1, rate_hz, movements))
 
     def save(self, path: str | Path) -> None:
         """Write the state, all at once; a stream that goes on from it gives the same answers.
@@ -181,14 +210,6 @@ class StreamingDiagnoser:
         stream._fleet, said = load_fleet(path, diagnoser, robots=1)
         stream._diagnosis = said[0] if said else None
         return stream
-
-    def _answer(self) -> Answer:
-        state = STALE if self._fleet.stale[0] else OK
-        return Answer(self._fleet.time, state, self._diagnosis)
-
-    def _told(self) -> Diagnosis | None:
-        found = self._fleet.diagnosis(0, self._diagnosis)
-        return None if found is None else replace(found, run="stream")
 
 
 def row_of(values: ArrayLike | None) -> FloatArray | None:

@@ -175,7 +175,9 @@ class StreamingFleet:
             InputError: If the shapes do not fit, or the time is not finite or far older than the
                 newest.
         """
-        reference, points = self._checked(time, command, measured)
+        motors = len(self.diagnoser.twin.robot.motors)
+        reference = self._rows(command, motors, "commands")
+        points = self._rows(measured, 3, "readings")
         time = self._by_own_clock(time)
         heard_s, read = self._beliefs.heard_s, np.isfinite(points).all(axis=1)
         heard_s[read] = np.maximum(heard_s[read], time)
@@ -185,24 +187,16 @@ class StreamingFleet:
         points = np.where(split[:, None], np.nan, points)
         away = self._astray(time, reference, points)
         sensors = self.model.sensors
-        points = sensors.reading(points, self._reported(position))
+        points = sensors.reading(points, self._rows(position, motors, "motor readings"))
         begun, at_rest = self._tracker.take(time, reference, points, away)
         self._beliefs.point[begun] = np.nan
         if sensors.goals and goal is not None:
-            told = self._tracker.see_goals(self._reported(goal))
+            told = self._tracker.see_goals(self._rows(goal, motors, "goals"))
             self._beliefs.point[told] = np.nan
         self._untold.begin(np.union1d(begun, np.flatnonzero(self._tracker.references.moved)))
         judged = self._judge(self._with_news(at_rest))
         odd = np.flatnonzero((self._odd != before).any(axis=0))
         return np.unique(np.concatenate([died, odd, judged]))
-
-    def _reported(self, position: ArrayLike | None) -> FloatArray:
-        """Return what the motors report, (robot, motor) [rad]; NaN where they do not."""
-        shape = self.robots, len(self.diagnoser.twin.robot.motors)
-        found = np.full(shape, np.nan) if position is None else as_floats(position)
-        if found.shape != shape:
-            raise InputError(f"motor readings have shape {found.shape}, expected {shape}.")
-        return found
 
     def _astray(self, time: float, reference: FloatArray, points: FloatArray) -> BoolArray:
         """Return tools that left where they rested without a command, (robot,)."""
@@ -341,6 +335,8 @@ class StreamingFleet:
 
     def _by_own_clock(self, time: float) -> float:
         """Return the time since the first sample [s]; small numbers are exact."""
+        if not (isinstance(time, Real) and isfinite(time)):
+            raise InputError(f"a sample is of {time!r} s. Expected one finite number.")
         if self._zero is None:
             self._zero = time
         own = time - self._zero
@@ -385,20 +381,15 @@ class StreamingFleet:
             "split": self._split,
         }
 
-    def _checked(
-        self, time: float, command: ArrayLike | None, measured: ArrayLike | None
-    ) -> tuple[FloatArray, FloatArray]:
-        robots, motors = self.robots, len(self.diagnoser.twin.robot.motors)
-        reference = np.full((robots, motors), np.nan) if command is None else as_floats(command)
-        points = np.full((robots, 3), np.nan) if measured is None else as_floats(measured)
-        if reference.shape != (robots, motors) or points.shape != (robots, 3):
+    def _rows(self, values: ArrayLike | None, columns: int, what: str) -> FloatArray:
+        """Return values with a row for each robot, (robot, column); NaN where there are none."""
+        shape = self.robots, columns
+        found = np.full(shape, np.nan) if values is None else as_floats(values)
+        if found.shape != shape:
             raise InputError(
-                f"a sample has commands {reference.shape} and readings {points.shape}. Expected "
-                f"({robots}, {motors}), a row for each robot, and ({robots}, 3)."
+                f"{what} have shape {found.shape}. Expected {shape}, a row for each robot."
             )
-        if not (isinstance(time, Real) and isfinite(time)):
-            raise InputError(f"a sample is of {time!r} s. Expected one finite number.")
-        return reference, points
+        return found
 
     def _alive(
         self, time: float, command: FloatArray, points: FloatArray

@@ -7,18 +7,17 @@ the robot itself teaches (`HealthyMixture`, `LifeLearner`); the alarm comes from
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from failuretwin.connection.links.base import OK, STALE, Answer
-from failuretwin.core.hypothesis import CLEAR, Diagnosis, Hypothesis
+from failuretwin.core.hypothesis import CLEAR, Hypothesis
 from failuretwin.core.numerics import Weighted, log_of
-from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
-from failuretwin.decision.streaming.diagnoser import reference_of, row_of
+from failuretwin.decision.streaming.diagnoser import RobotStream
 from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.decision.streaming.learning import LifeLearner
 from failuretwin.decision.streaming.set_up_watch import PROOF, SetUpWatch
@@ -33,7 +32,7 @@ from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.rounding import rounded, told_of
 from failuretwin.inference.posterior import StreamPosition
-from failuretwin.inference.together.fault_filter import RATES, FaultFilter, FaultRates
+from failuretwin.inference.together.fault_filter import FaultFilter
 from failuretwin.inference.together.healthy_mixture import FOREIGN, HealthyMixture
 
 WORTH_LEARNING = 0.01
@@ -82,13 +81,12 @@ class Believed:
     sizes: Sequence[Weighted | None]
 
 
-class FaultMonitor:
-    """Watches one robot; times and samples as of `StreamingDiagnoser.update`.
+class FaultMonitor(RobotStream):
+    """Watches one robot: its faults, its set-up and how it differs from its calibration.
 
     Args:
         diagnoser: The method, with its hypotheses and healthy behaviour.
         false_alarms_per_100h: False alarms that are allowed in 100 hours of work.
-        rates: How often faults come and go.
 
     Raises:
         InputError: If the budget makes no sense, or a hypothesis cannot be followed.
@@ -98,9 +96,8 @@ class FaultMonitor:
         self,
         diagnoser: BayesDiagnoser,
         false_alarms_per_100h: float = 1.0,
-        rates: FaultRates = RATES,
     ) -> None:
-        self._fleet = StreamingFleet(diagnoser, 1)
+        super().__init__(StreamingFleet(diagnoser, 1))
         known = diagnoser.healthy_model
         ideal, cold = known.imperfections.settling is None, known.imperfections.name == GENERIC_NAME
         learns = known.sensors.tool_alone and not ideal
@@ -112,7 +109,7 @@ class FaultMonitor:
             kind = generic_imperfections(known.twin.robot)
             self._models.append(HealthyModel.of(known.twin, kind).seen_by(known.sensing))
         hypotheses, priors = diagnoser.hypothesis_set, diagnoser.priors
-        filters = [FaultFilter(model, hypotheses, priors, rates) for model in self._models]
+        filters = [FaultFilter(model, hypotheses, priors) for model in self._models]
         share = [1.0] if len(filters) == 1 else [1.0 - FOREIGN, FOREIGN]
         self._mixture = HealthyMixture(filters, np.array(share))
         self._given = "" if cold else known.imperfections.name
@@ -122,7 +119,6 @@ class FaultMonitor:
         self._concluded = self._present = self._mixture.begin(1)
         self._movements = 0
         self._explained: dict[int, float] = {}
-        self._diagnosis: Diagnosis | None = None
         self._set_up = SetUpWatch(diagnoser)
         self._arrived = np.full((0, len(known.scatter)), np.nan)
         self._rests, self._misfit = False, 0.0
@@ -153,42 +149,6 @@ class FaultMonitor:
         probability = self._mixture.posterior(self._present)[0]
         return Believed(self._models[best], own.hypotheses, probability, sizes)
 
-    def update(
-        self,
-        time: float,
-        command: Mapping[str, float] | ArrayLike | None,
-        measured: ArrayLike | None,
-        position: ArrayLike | None = None,
-        goal: ArrayLike | None = None,
-    ) -> Answer:
-        """Take what is known at a time and return what is believed then.
-
-        Args:
-            time: Time of the stream [s]; a sample may come late, as long as its movement lasts.
-            command: Reference of every motor, by name or (motor,) [rad]; None: not known.
-            measured: Tool position, (axis,) [m]; None or NaN: no reading.
-            position: What the motors report of themselves, (motor,) [rad], where that is believed.
-            goal: Goals that they report to have received, (motor,) [rad], where these are believed.
-
-        Raises:
-            InputError: If a motor is missing, shapes do not fit or the time is not finite.
-        """
-        motors = self._fleet.diagnoser.twin.robot.motor_names
-        reference = reference_of(motors, command)
-        point = None if measured is None else as_floats(measured)
-        rows = map(row_of, (reference, point, position, goal))
-        if len(self._fleet.update(time, *rows)):
-            self._judge()
-        self._set_up.see(time, reference, point)
-        self._count_rounding()
-        return self._answer()
-
-    def conclude(self) -> Answer:
-        """Count all that has come, as if the stream were over."""
-        self._fleet.conclude()
-        self._judge()
-        return self._answer()
-
     def _answer(self) -> Answer:
         """Return what is believed; where something is in doubt, no motor is blamed."""
         state, reason = STALE if self._fleet.stale[0] else OK, self._in_doubt()
@@ -210,8 +170,9 @@ class FaultMonitor:
         odd = BEGINS_ODDLY if young and self._misfit > FITS else ""
         return self._set_up.against(alarm) or odd or self._unheard(alarm.cause)
 
-    def _count_rounding(self) -> None:
-        """Count as noise what the sensor was found to round off."""
+    def _watch(self, time: float, reference: FloatArray | None, point: FloatArray | None) -> None:
+        """Look at the set-up, and count as noise what the sensor was found to round off."""
+        self._set_up.see(time, reference, point)
         found = self._set_up.rounding
         if self._fleet.rounding is None and found is not None:
             self._fleet.count_as_noise(found)

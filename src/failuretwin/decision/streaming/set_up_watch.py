@@ -16,10 +16,10 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import RAISED, Alarm, Hypothesis
-from failuretwin.core.polyline import TURN_RAD
 from failuretwin.core.runs import concatenate, time_step
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.timed_log import Samples, TimedLog, timed_run
+from failuretwin.decision.streaming.tracking import References
 from failuretwin.decision.streaming.trouble import rests_throughout
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import Signature
@@ -48,8 +48,6 @@ CHANGES = 2
 """An alarm that has named another motor so often is none of a motor."""
 AGAIN = 1.5
 """By what factor movements grow until an alarm that stands makes one look at the set-up again."""
-STILL_STEPS = 2
-"""Samples without a change after which a reference rests."""
 
 
 @dataclass
@@ -67,8 +65,7 @@ class StreamRuns:
     )
     _rows: list[tuple[float, FloatArray, FloatArray]] = field(default_factory=list)
     _in_run: int = 0
-    _stood: FloatArray | None = None
-    _still: int = STILL_STEPS
+    _reference: References | None = None
 
     def add(self, time: float, command: FloatArray | None, point: FloatArray | None) -> None:
         """Take a sample.
@@ -81,9 +78,9 @@ class StreamRuns:
         known = command is not None and bool(np.isfinite(command).all())
         if known and command is not None:
             self._follow(time, command)
-        if self._stood is None:  # nothing was commanded yet
+        if self._reference is None:  # nothing was commanded yet
             return
-        told = command if known and command is not None else np.full_like(self._stood, np.nan)
+        told = command if known and command is not None else np.nan * self._reference.last[0]
         self._rows.append((time, told, np.full(3, np.nan) if point is None else point))
 
     @property
@@ -97,13 +94,14 @@ class StreamRuns:
 
     def _follow(self, time: float, command: FloatArray) -> None:
         """Note whether a movement begins, and where a run is over."""
-        turns = self._stood is not None and np.abs(command - self._stood).max() > TURN_RAD
-        if self._stood is None or turns:
-            self._stood = command
-        if not turns:
-            self._still += 1
+        if self._reference is None:
+            self._reference = References.empty(run=1, motor=len(command))
+        moved = self._reference.moved
+        moves = bool(moved[0])
+        moved[self._reference.see(time, command[None])] = False
+        if self._reference.still[0] > 0:  # it does not turn
             return
-        begins, self._still = self._still >= STILL_STEPS, 0
+        begins = bool(moved[0]) and not moves
         long = bool(self._rows) and time - self._rows[0][0] > LONGEST_RUN_S
         if (begins and self._in_run >= RUN) or long:
             self._cut()

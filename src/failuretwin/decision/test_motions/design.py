@@ -19,9 +19,9 @@ import numpy as np
 from failuretwin.connection.links.base import Order
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.safety import SafetyGate, Way
+from failuretwin.decision.acting.safety import LEAST_RAMP_S, SafetyGate, Way
 from failuretwin.decision.acting.work import QUIET_S
-from failuretwin.decision.test_motions.outlook import Asked, Outlook, of_posterior
+from failuretwin.decision.test_motions.outlook import Outlook, of_posterior
 from failuretwin.inference.observation.evidence import SETTLING_S
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
@@ -138,12 +138,14 @@ class Designer:
         told = np.array([start, *(movement.order.target for movement in made)])
         since = np.cumsum([0.0, *(movement.seconds for movement in made)])
         outlook = self.outlook.after(told)
-        before = Asked.of(told, since[1:])
-        nats = outlook.distances(before).sum(axis=0)
+        made_so_far = told[1:], told[:-1], since[1:], np.arange(len(made))
+        nats = outlook.distances(*made_so_far).sum(axis=0)
 
         def score_of(poses: FloatArray) -> FloatArray:
-            asked = Asked.one_of(poses, before, told[-1], float(since[-1]))
-            gained = outlook.information(nats + outlook.distances(asked))
+            count = len(poses)
+            before = np.tile(told[-1], (count, 1)), np.full(count, since[-1])
+            next_nats = outlook.distances(poses, *before, np.full(count, len(made)))
+            gained = outlook.information(nats + next_nats)
             needed = np.array([self.gate.least_duration(pose - told[-1]) for pose in poses])
             return np.asarray((gained - outlook.information(nats)) / (needed + self.rest_s))
 
@@ -171,7 +173,7 @@ class Designer:
                 continue
             made.append(found)
             left, at = left - found.seconds, found.order.target
-            if len(made) == most or left < self.rest_s + self.gate.limits.least_ramp_s:
+            if len(made) == most or left < self.rest_s + LEAST_RAMP_S:
                 break
         return made
 
@@ -213,22 +215,20 @@ def next_movement(
     posterior: Posterior,
     at: FloatArray,
     seed: int = 0,
-    row: int = 0,
 ) -> Order | None:
     """Return the movement that is expected to settle best what a posterior leaves open.
 
     Args:
         model: The healthy robot.
         gate: What is safe.
-        posterior: Of one arm, or of several.
+        posterior: Of one run.
         at: What its motors were told last, (motor,) [rad].
         seed: Seed of the poses that are tried.
-        row: Which arm.
 
     Returns:
         The order; None: none is safe, or nothing is left to ask.
     """
-    members = of_posterior(posterior, row)
+    members = of_posterior(posterior)
     if len({member.hypothesis for member in members}) < 2:
         return None
     found = Designer(gate, Outlook(model, members), seed).next(at)

@@ -1,4 +1,4 @@
-"""The result of a health check: what test movements say of every motor, and if that is enough.
+"""A health check of one robot: the movements made, and what they say of every motor.
 
     green: P(healthy) >= 0.95;    red: P(motor k), the sum over its modes, >= 0.95;    else open
 
@@ -7,11 +7,15 @@ Section: docs/check.md#result-of-a-check
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
 
 import numpy as np
 
+from failuretwin.connection.links.base import Commander, Order
 from failuretwin.core.hypothesis import (
     FAULTY_STATE,
     HEALTHY_STATE,
@@ -20,20 +24,35 @@ from failuretwin.core.hypothesis import (
     Diagnosis,
     Hypothesis,
     motor_probabilities,
+    paper_hypotheses,
 )
-from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.judging import shown_faults
+from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.decision.acting.belief import settled_evidence_of, shown_faults
+from failuretwin.decision.acting.believed_arm import Seen
+from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
+from failuretwin.decision.acting.work import OrderSequence, Work, first_standing
+from failuretwin.decision.test_motions.design import Designer, next_movement
+from failuretwin.decision.test_motions.motions import Motions, holds_motions, read_motions
+from failuretwin.decision.test_motions.outlook import Outlook, of_priors
+from failuretwin.digital_model.calibrated_robot import (
+    CalibratedRobot,
+    HealthyLike,
+    RobotLike,
+    calibrated,
+)
 from failuretwin.digital_model.nonidealities import Variation
 from failuretwin.failure_behavior.mode import Range, Signature
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.engine.posterior import theta_posterior
 from failuretwin.inference.engine.registration import robot_weighing, sensor_in_doubt
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.faults.priors import Priors, visible_sizes
-from failuretwin.inference.isolability import IsolabilityReport
+from failuretwin.inference.isolability import IsolabilityReport, isolability
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.observation.log_quality import BEYOND_USUAL
+from failuretwin.inference.observation.log_quality import BEYOND_USUAL, LogQuality
 from failuretwin.inference.observation.settings import ERROR_STEPS, WIDEST_ERROR
 from failuretwin.inference.posterior import Posterior, log_prior
 from failuretwin.inference.theta.shared_posterior import shared_posterior
@@ -178,18 +197,241 @@ def judged(
     return shared_posterior(likelihood, hypotheses, priors, in_doubt)
 
 
-def result_of(
-    likelihood: RunLikelihood,
-    hypotheses: Sequence[Hypothesis],
-    priors: Priors,
-    diagnosis: Diagnosis,
-    further: int = 0,
-) -> CheckResult:
-    """Return the result of a check: its diagnosis, with zeros and play.
+MOST_RUNS = 3
+"""Runs of a log whose motions are examined, evenly spread."""
+RANDOM_S = 20.0
+"""Length of random motions where no others are given [s]."""
 
-    Designed movements reach the joint limits, so commands outside the usual ranges are no remark.
+
+@dataclass(frozen=True)
+class Checking:
+    """What a check and a design need.
+
+    Attributes:
+        known: The robot as it is known.
+        gate: What is safe.
+        named: Hypotheses that the user names; None: all faults that show at rest.
+        usual: Whether poses keep to the ranges of usual movements.
+        seed: Seed of the poses that are tried.
+        rest_s: Time that is left for coming to rest after each movement at least [s].
     """
-    remarks = tuple(line for line in diagnosis.quality if not line.startswith(BEYOND_USUAL))
-    diagnosis = replace(diagnosis, quality=remarks)
-    offsets = motor_offsets(likelihood, hypotheses, priors)
-    return CheckResult(diagnosis, offsets, int(likelihood.usable.sum()), further)
+
+    known: CalibratedRobot
+    gate: SafetyGate
+    named: Sequence[Hypothesis] | None = None
+    usual: bool = False
+    seed: int = 0
+    rest_s: float = 0.0
+
+    @cached_property
+    def model(self) -> HealthyModel:
+        """The healthy robot."""
+        return HealthyModel.of(self.known.twin, self.known.imperfections)
+
+    @cached_property
+    def hypotheses(self) -> Sequence[Hypothesis]:
+        """What is weighed."""
+        return self.named or faults_at_rest(self.model)
+
+    @cached_property
+    def priors(self) -> Priors:
+        """Beliefs about what is weighed."""
+        return checking(self.model, self.hypotheses)
+
+    @property
+    def asked(self) -> Sequence[Hypothesis]:
+        """What movements are chosen to tell apart."""
+        return self.named or paper_hypotheses(self.model.motor_names)
+
+    @property
+    def home(self) -> FloatArray:
+        """Where an arm is taken to stand that is not asked, (motor,) [rad]."""
+        return self.known.robot.resting_pose
+
+    @property
+    def designer(self) -> Designer:
+        """What chooses movements."""
+        members = of_priors(self.model, self.asked, checking(self.model, self.asked))
+        outlook = Outlook(self.model, members)
+        return Designer(self.gate, outlook, self.seed, self.usual, self.rest_s)
+
+    def motions(self, seconds: float, repeat: Path | None = None, most: int = 1000) -> Motions:
+        """Return the motions of a check: those of a file, or designed anew.
+
+        Args:
+            seconds: Time for all of them [s].
+            repeat: The file; None: they are designed.
+            most: So many at most.
+
+        Raises:
+            InputError: If the file cannot be read or is of another robot, or no movement is safe.
+        """
+        if repeat is not None:
+            return read_motions(repeat, self.known.robot)
+        made = self.designer.sequence(self.home, seconds, most)
+        return Motions.of(self.known.robot, made)
+
+    def isolability(self, command: FloatArray, time: FloatArray) -> IsolabilityReport:
+        """Return what motions can tell apart, by the priors of a check.
+
+        Args:
+            command: References, (sample, motor) or (run, sample, motor) [rad].
+            time: Their times, (sample,) [s].
+        """
+        known, priors = self.known, checking(self.model, self.asked)
+        return isolability(known.twin, command, time, known.imperfections, self.asked, priors)
+
+    def isolability_of(self, motions: Motions) -> IsolabilityReport:
+        """Return the isolability of designed motions."""
+        time, command = motions.reference()
+        return self.isolability(command, time)
+
+    def random_motions(self, seconds: float = RANDOM_S, most: int = 1000) -> Motions:
+        """Return random movements within the usual ranges, at most `seconds` long [s]."""
+        designer = replace(self, usual=True).designer
+        return Motions.of(self.known.robot, designer.random(self.home, seconds, most))
+
+    def isolability_in(self, path: Path) -> IsolabilityReport:
+        """Return the isolability of motions in a file: designed ones, or those of a log.
+
+        Raises:
+            InputError: If it cannot be read, or holds no movement.
+        """
+        from failuretwin.data_knowledge.readers.read import read_runs
+
+        if holds_motions(path, self.known.robot):
+            return self.isolability_of(read_motions(path, self.known.robot))
+        runs = read_runs(path, self.known.robot)
+        subset = np.unique(np.linspace(0, runs.sizes["run"] - 1, MOST_RUNS).astype(np.int64))
+        command = as_floats(runs["command"].values)[subset]
+        return self.isolability(command, as_floats(runs["time"].values))
+
+    def shown(self, result: CheckResult, command: FloatArray, time: FloatArray) -> CheckResult:
+        """Return a result with what its movements can show, where it says that all is well.
+
+        Args:
+            result: The result.
+            command: References of its movements, (run, sample, motor) [rad].
+            time: Their times, (sample,) [s].
+        """
+        if result.light != GREEN:
+            return result
+        return replace(result, shown=self.isolability(command, time))
+
+    def of_logs(self, paths: Sequence[Path]) -> list[CheckResult]:
+        """Return what logs of a check say that was made elsewhere, a result a run.
+
+        Raises:
+            InputError: If they cannot be read.
+        """
+        from failuretwin.data_knowledge.readers.read import read_runs
+
+        runs = read_runs(list(paths), self.known.robot)
+        known = self.known
+        diagnoser = BayesDiagnoser(known.twin, known.imperfections, self.hypotheses, self.priors)
+        settled = Evidence(runs, self.model.settings).sound.settled
+        command, time = as_floats(runs["command"].values), as_floats(runs["time"].values)
+        results = []
+        for row, diagnosis in enumerate(diagnoser.diagnose(runs)):
+            part = slice(row, row + 1)
+            result = self._result(RunLikelihood(settled[part], self.model), diagnosis)
+            results.append(self.shown(result, command[part], time))
+        return results
+
+    # Movements on an arm.
+
+    def carry_out(
+        self, motions: Motions, further: int, commander: Commander, tell: Callable[[str], None]
+    ) -> CheckResult:
+        """Make planned movements on an arm, then further ones while the result is open.
+
+        Args:
+            motions: Planned movements.
+            further: Maximum number of further movements.
+            commander: The arm.
+            tell: Called with what happens.
+
+        Raises:
+            InputError: If it is not known where the arm stands.
+            Halted: If somebody else commands the arm, or it falls silent.
+            UnsafeOrderError: If an order must not be sent.
+        """
+        standing, planned = first_standing(commander), motions.orders
+        travel = motions.start - standing
+        if np.abs(travel).max() > 1e-6:
+            ramp = np.full(len(standing), self.gate.least_duration(travel))
+            planned = [Order(motions.start, ramp), *planned]
+        window = list[Seen]()
+        orders = chain(planned, self._further(further, window, tell))
+        sequence = OrderSequence(self.model, standing, orders, window)
+        Work(sequence, self.gate, commander, standing).carry_out()
+        return self._found(window, len(window) - len(planned))[0]
+
+    def _further(
+        self, most: int, window: Sequence[Seen], tell: Callable[[str], None]
+    ) -> Iterator[Order]:
+        """Yield movements that settle what those in the window leave open."""
+        for number in range(1, most + 1):
+            result, posterior = self._found(window)
+            if result.light != OPEN:
+                return
+            at = window[-1].command
+            order = next_movement(self.model, self.gate, posterior, at, self.seed)
+            if order is None:
+                return
+            tell(f"still open: further movement {number}")
+            yield order
+
+    def _found(self, window: Sequence[Seen], further: int = 0) -> tuple[CheckResult, Posterior]:
+        """Return the result of movements, and the posterior of all hypotheses."""
+        likelihood = RunLikelihood(settled_evidence_of([window]), self.model)
+        posterior = judged(likelihood, self.hypotheses, self.priors)
+        diagnosis = posterior.to_diagnosis(0, "check", LogQuality())
+        return self._result(likelihood, diagnosis, further), posterior
+
+    def _result(
+        self, likelihood: RunLikelihood, diagnosis: Diagnosis, further: int = 0
+    ) -> CheckResult:
+        """Return a diagnosis with zeros and play.
+
+        Designed movements reach the joint limits, so commands outside the usual ranges are no
+        remark.
+        """
+        remarks = tuple(line for line in diagnosis.quality if not line.startswith(BEYOND_USUAL))
+        offsets = motor_offsets(likelihood, self.hypotheses, self.priors)
+        movements = int(likelihood.usable.sum())
+        return CheckResult(replace(diagnosis, quality=remarks), offsets, movements, further)
+
+
+def check(
+    commander: Commander,
+    robot: RobotLike = "armpi_fpv",
+    calibration: HealthyLike = None,
+    seconds: float = 20.0,
+    further: int = 0,
+    limits: SafetyLimits | None = None,
+    tell: Callable[[str], None] = print,
+) -> CheckResult:
+    """Check an arm by test movements; the arm moves.
+
+    Args:
+        commander: The arm.
+        robot: The robot, its name or its profile.
+        calibration: What `calibrate` learned of it, by name or path; None: what its profile names.
+        seconds: Time for the movements [s].
+        further: So many further movements at most, if it is still open then what is wrong.
+        limits: What orders must keep to; None: the usual limits.
+        tell: Called with what happens.
+
+    Returns:
+        What was found.
+
+    Raises:
+        InputError: If something cannot be read, no movement is safe, or it is not known where the
+            arm stands.
+        Halted: If somebody else commands the arm, or it falls silent.
+        UnsafeOrderError: If an order must not be sent.
+    """
+    known = calibrated(robot, calibration)
+    asking = Checking(known, SafetyGate(known.robot, limits or SafetyLimits()))
+    return asking.carry_out(asking.motions(seconds), further, commander, tell)

@@ -97,13 +97,13 @@ def _prior_sizes(model: HealthyModel, hypothesis: Hypothesis, priors: Priors) ->
     return [*(-sizes if mode.signed else []), *sizes]
 
 
-def of_posterior(posterior: Posterior, row: int) -> list[Member]:
-    """Return members of what is left after some movements, sizes at quantiles of what they say."""
-    shares = np.exp(posterior.log_posterior[row])
+def of_posterior(posterior: Posterior) -> list[Member]:
+    """Return members of what is left of one run, sizes at quantiles of what it says."""
+    shares = np.exp(posterior.log_posterior[0])
 
     def size_of(at: int) -> Weighted | None:
         healthy = posterior.hypotheses[at].is_healthy
-        return None if healthy else posterior.weights[at].estimate(row).size
+        return None if healthy else posterior.weights[at].estimate(0).size
 
     return _at_quantiles(posterior.hypotheses, shares, size_of)
 
@@ -139,40 +139,6 @@ def _at_quantiles(
 
 def _levels(count: int) -> FloatArray:
     return (np.arange(count) + 0.5) / count
-
-
-@dataclass(frozen=True)
-class Asked:
-    """Movements that are made, or might be.
-
-    Attributes:
-        command: What motors are told, (movement, motor) [rad].
-        previous: What they were told before, (movement, motor) [rad].
-        since_s: How long faults have been there by then, (movement,) [s].
-        number: Which movement it is, from 0, (movement,).
-    """
-
-    command: FloatArray
-    previous: FloatArray
-    since_s: FloatArray
-    number: IntArray
-
-    @classmethod
-    def of(cls, told: FloatArray, since_s: FloatArray) -> Asked:
-        """Return movements one after the other.
-
-        Args:
-            told: What motors are told, the start first, (movement + 1, motor) [rad].
-            since_s: When each movement is over, (movement,) [s].
-        """
-        return cls(told[1:], told[:-1], since_s, np.arange(len(told) - 1))
-
-    @classmethod
-    def one_of(cls, poses: FloatArray, made: Asked, at: FloatArray, since_s: float) -> Asked:
-        """Return each of some poses (movement, motor) as the next movement after others."""
-        count = len(poses)
-        number = np.full(count, len(made.command))
-        return cls(poses, np.tile(at, (count, 1)), np.full(count, since_s), number)
 
 
 @dataclass(frozen=True)
@@ -227,17 +193,25 @@ class Outlook:
             count += 1
         return Outlook(self.model, members)
 
-    def expected(self, asked: Asked) -> tuple[FloatArray, FloatArray]:
-        """Return mean and covariance of what is seen at rest.
+    def expected(
+        self, command: FloatArray, previous: FloatArray, since_s: FloatArray, number: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of what is seen at rest after movements.
+
+        Args:
+            command: What motors are told, (movement, motor) [rad].
+            previous: What they were told before, (movement, motor) [rad].
+            since_s: How long faults have been there by then, (movement,) [s].
+            number: Which movement it is, from 0, (movement,).
 
         Returns:
             (movement, member, channel) [m] and (movement, member, channel, channel) [m2].
         """
-        told = asked.command, asked.previous, asked.since_s
+        told = command, previous, since_s
         healthy = BelievedArm(self.model).expected(*told)
         pose, scatter = (np.repeat(each[:, None], len(self.members), axis=1) for each in healthy)
         for at, member in enumerate(self.members):
-            struck = asked.number >= member.first
+            struck = number >= member.first
             arm = BelievedArm(self.model, member.fault(self.model))
             if arm.fault is not None and struck.any():
                 rows = (each[struck] for each in told)
@@ -247,9 +221,14 @@ class Outlook:
         noise = self.model.path_noise**2 * np.eye(mean.shape[-1])
         return mean, root @ np.swapaxes(root, -1, -2) + noise
 
-    def distances(self, asked: Asked) -> FloatArray:
-        """Return how far members are apart by each movement, (movement, member, member) [nats]."""
-        mean, spread = self.expected(asked)
+    def distances(
+        self, command: FloatArray, previous: FloatArray, since_s: FloatArray, number: IntArray
+    ) -> FloatArray:
+        """Return how far members are apart by each movement, (movement, member, member) [nats].
+
+        Arguments as of `expected`.
+        """
+        mean, spread = self.expected(command, previous, since_s, number)
         return pairwise_distance(mean, spread, self.model.settling.tail_dof, self.most_nats)
 
     def information(self, nats: FloatArray) -> FloatArray:

@@ -150,7 +150,7 @@ class Prober:
             tell(NOTHING_SAFE if order is None else f"{would_order(order)}, then back; {MOVE}")
             return
         sequence = OrderSequence(self._monitor.believed.model, home, orders)
-        work = Work(sequence, self._gate, self._commander, home, tell, hear)
+        work = Work(sequence, self._gate, self._commander, home, hear)
         self._asking = True
         try:
             work.carry_out()
