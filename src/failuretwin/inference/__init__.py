@@ -11,6 +11,7 @@ section of docs/inference.md (words: docs/glossary.md):
                     covariance S; lost commands w_a
     movements/      L_m: what a movement says of the angles of the motors
     faults/         a file a signature: change point m0, nodes z, their prior; pairs, unknown
+    engine/         evidence of runs of every robot: theta integrated out, moment by moment
     theta/          what movements share (registration, offsets), integrated out
     set_ups/        wrong set-ups of a log, and what undoes each
     together/       folders, lives and streams of one robot

@@ -4,19 +4,20 @@
 
 Read in this order; each module states its term:
 
+    symmetric      packed symmetric matrices: an array for each entry of the lower triangle
     integral       one moment under one row: evidence, mean and covariance of f, in closed form
     filter         moment by moment, and every moment again given all others
-    moments        settled positions -> moments
-    theta          what a robot shares: registration, offsets, joint frames; scatter and noise
-    outcomes       what may have become of a moment: residual and scale
-    rows           what is discrete of a hypothesis; amount_rows, redrawn_rows: by signature
+    moments        settled positions and readings on the way -> moments
+    theta          shared parameters: registration, offsets, joint frames, lags; scatter and noise
+    outcomes       outcomes of a moment: residual and scale
+    rows           discrete parts of a hypothesis; amount_rows, redrawn_rows: by signature
     picks, runs    rows by components of the robot: the evidence of every hypothesis
-    posterior      what is left of onset, size and theta
+    posterior      posterior of onset, size and theta
     weighing       all hypotheses by runs whose theta is a mixture of normal distributions
-    registration   runs of a robot that nobody has calibrated, or whose sensor may be displaced
-    scatter        what moments say of how far motors scatter
+    registration   runs of any robot, calibrated or not; a sensor that may be displaced
+    scatter        evidence on the scatter of the motors
 
-Healthy, held, constant, growing and redrawn faults have rows. Faults of the way, pairs and unknown
-ones are weighed at the most probable theta. Runs of calibrated robots are weighed by `movements`
-and `faults`, where theta is known.
+Healthy, held, constant, growing and redrawn faults have rows, for calibrated robots too. The nodes
+of `movements` and `faults` weigh streams, wrong set-ups at rest and isolability. They also weigh
+faults that show on the way, pairs and unknown faults, at the most probable theta.
 """
