@@ -7,7 +7,7 @@ its last movements say, with the same arithmetic as a recorded run.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
 from numbers import Real
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.decision.streaming import STREAMED
 from failuretwin.decision.streaming.tracking import MovementTracker
@@ -34,6 +34,7 @@ from failuretwin.digital_model.calibrated_robot import RobotLike
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import worded
+from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.log_quality import LogQuality
 from failuretwin.inference.observation.rounding import Rounding, rounded
@@ -44,6 +45,10 @@ from failuretwin.inference.posterior import (
     log_prior,
     shows_in_transients,
 )
+from failuretwin.inference.theta.shared_posterior import shared_posterior
+
+Weigh = Callable[[RunLikelihood, Sequence[Hypothesis], Priors], Posterior]
+"""Weighs hypotheses by some runs."""
 
 MOVEMENTS = 5
 """Movements that are remembered, the present one included: as many as a run of the paper has."""
@@ -232,7 +237,7 @@ class StreamingFleet:
             tracker.find_movements(int(robot))
         there = np.flatnonzero(tracker.window.count > 0)
         tracker.conclude(there)
-        self._judge(there)
+        self._judge(there, _as_recorded)
 
     def diagnosis(
         self,
@@ -424,7 +429,7 @@ class StreamingFleet:
         window = self._tracker.window
         return window.settled.point[robots, window.count[robots] - 1]
 
-    def _judge(self, robots: IntArray) -> IntArray:
+    def _judge(self, robots: IntArray, weigh: Weigh = compute_posterior) -> IntArray:
         """Renew what is believed of robots by what their last movements say."""
         window, beliefs = self._tracker.window, self._beliefs
         for robot in robots:
@@ -434,7 +439,7 @@ class StreamingFleet:
         for group in (robots[on_way], robots[~on_way]):
             if len(group) == 0:
                 continue
-            posterior_of_runs = self._judgement(group)
+            posterior_of_runs = self._judgement(group, weigh)
             for at, robot in enumerate(group):
                 undecided = posterior_of_runs.undecided(at, LogQuality())
                 beliefs.posterior[robot] = posterior_of_runs.posterior(at, undecided)
@@ -450,7 +455,7 @@ class StreamingFleet:
         unseen = (there & ~window.settled.usable[robots]).any(axis=1)
         return np.asarray(self.diagnoser.uses_transients & (unseen | self._everything_counts))
 
-    def _judgement(self, robots: IntArray) -> Posterior:
+    def _judgement(self, robots: IntArray, weigh: Weigh = compute_posterior) -> Posterior:
         diagnoser, window = self.diagnoser, self._tracker.window
         settled, transient = window.evidence(robots)
         counts = self._on_way(robots).any()
@@ -458,4 +463,11 @@ class StreamingFleet:
         model = self.model
         likelihoods = window.judge(robots, settled, model)
         likelihood = RunLikelihood(settled, model, moving, remembered=likelihoods)
-        return compute_posterior(likelihood, diagnoser.hypothesis_set, diagnoser.priors)
+        return weigh(likelihood, diagnoser.hypothesis_set, diagnoser.priors)
+
+
+def _as_recorded(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> Posterior:
+    """Weigh hypotheses as of recorded runs, which takes too long for every sample."""
+    return shared_posterior(likelihood, hypotheses, priors, in_doubt=False)

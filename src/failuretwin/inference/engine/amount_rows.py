@@ -28,8 +28,9 @@ from failuretwin.inference.engine.theta import columns
 from failuretwin.inference.faults.fault_sizes import SizePrior, coarse_sizes
 from failuretwin.inference.faults.priors import OnsetIntervals, plateau_or_ramp
 
-Angle = Callable[[FloatArray], FloatArray]
-"""Angle of the motor at some amounts, (run, row, node) -> (run, row, moment, node) [rad]."""
+Angle = Callable[[FloatArray, int], FloatArray]
+"""Angle of the motor at some amounts if this or that outcome of the commands is what happened,
+(run, row, node) -> (run, row, moment, node) [rad]."""
 GRID = 61
 """Held angles among which the best is looked for."""
 FREE_RAD = 0.08
@@ -83,7 +84,7 @@ class _Motor:
         """
         scene, rows = self.scene, len(self.first)
         shape = (len(grid), 1 if alike else rows, grid.shape[1])
-        angle = self.angle(np.broadcast_to(grid[:, None], shape))
+        angle = self.angle(np.broadcast_to(grid[:, None], shape), 0)
         step = np.abs(np.diff(angle, axis=-1)).mean(axis=-1, keepdims=True)
         error, jacobian, _ = self._residual(angle)
         variance = np.broadcast_to(self.variance, jacobian[..., 0, :].shape).copy()
@@ -105,7 +106,7 @@ class _Motor:
     def refined(self, x: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
         """Return amounts (run, row) after some Gauss-Newton steps, within (run, 1) limits."""
         for _ in range(STEPS):
-            angle = self.angle(x[..., None])
+            angle = self.angle(x[..., None], 0)
             slope = self.slope(x)
             error, jacobian, _ = self._residual(angle)
             error, jacobian = error[:, :, :, 0], jacobian[:, :, :, 0]
@@ -125,7 +126,7 @@ class _Motor:
     def slope(self, x: FloatArray) -> FloatArray:
         """Return dphi/dx, (run, row, moment)."""
         step = 1e-4
-        low, high = (self.angle((x + h)[..., None])[..., 0] for h in (-step, step))
+        low, high = (self.angle((x + h)[..., None], 0)[..., 0] for h in (-step, step))
         return (high - low) / (2.0 * step)
 
     @property
@@ -166,12 +167,13 @@ class _Motor:
             onsets: Samples of the onset and their shares, (run, row, sample) each.
         """
         scene, moments, motor = self.scene, self.scene.moments, self.motor
-        angle = self.angle(x[..., None])[..., 0]  # (run, row, moment)
         base = np.repeat(moments.base[:, None], x.shape[1], axis=1)
-        if self.held:
-            base[..., motor] = angle[..., None]
-        else:  # off its targets, whatever became of the commands
-            base[..., motor] += (angle - scene.settled[:, None, :, motor])[..., None]
+        for a in range(base.shape[3]):
+            angle = self.angle(x[..., None], a)[..., 0]  # (run, row, moment)
+            if self.held:
+                base[..., a, motor] = angle
+            else:  # off where each outcome of the commands leads
+                base[..., a, motor] += angle - scene.pose[:, None, :, a, motor]
         direction = np.broadcast_to(moments.direction[:, None], base.shape)
         held = (np.arange(base.shape[-1]) == motor) & self.held
         pose = scene.model.settle(base, direction, held)
@@ -259,7 +261,8 @@ def _flat(plateau: FloatArray, ramp: FloatArray) -> FloatArray:
 
 
 def _held_angle(count: int) -> Angle:
-    def angle(x: FloatArray) -> FloatArray:
+    def angle(x: FloatArray, outcome: int) -> FloatArray:
+        del outcome
         return np.repeat(x[:, :, None], count, axis=2)
 
     return angle
@@ -366,20 +369,22 @@ def _offset_angle(scene: Scene, motor: int, mode: FaultMode, since: FloatArray) 
         since: For how long the fault has been there, (run, row, moment) [s].
     """
     moments, model = scene.moments, scene.model
-    target, direction = moments.base[:, :, 0, motor], moments.direction[:, :, 0, motor]
     travel = np.abs(moments.target - moments.origin)[..., motor]
-    load = np.zeros_like(target)
-    if mode.needs_compliance:
-        settling = model.settling
-        compliance = np.asarray(settling.compliance)
-        load = sag(model.twin.robot, scene.settled, compliance, settling.payload)[..., motor]
+    compliance, payload = np.asarray(model.settling.compliance), model.settling.payload
 
-    def angle(x: FloatArray) -> FloatArray:
+    def angle(x: FloatArray, outcome: int) -> FloatArray:
+        settled = scene.pose[:, :, outcome]
+        target, direction = (
+            values[:, :, outcome, motor] for values in (moments.base, moments.direction)
+        )
+        load = np.zeros_like(target)
+        if mode.needs_compliance:
+            load = sag(model.twin.robot, settled, compliance, payload)[..., motor]
         parts = (target - direction * travel, target, direction, load)
         origin, goal, way, weight = (part[:, None, :, None] for part in parts)
         arrival = Arrival(origin, goal, way, since[..., None], weight)
         off = mode.settled_offset(x[:, :, None], arrival)
-        return scene.settled[:, None, :, motor, None] + off
+        return settled[:, None, :, motor, None] + off
 
     return angle
 
