@@ -320,6 +320,7 @@ class StreamingFleet:
     def _found(self, robot: int) -> tuple[Posterior, int, StreamPosition]:
         """Return the last judgement of a robot, its row in that, and where the robot was."""
         if robot not in self._latest:
+            self._latest = {}
             self._remember(np.array([robot]), self._judgement(np.array([robot])))
         return self._latest[robot]
 
@@ -333,7 +334,7 @@ class StreamingFleet:
 
     def _remember(self, robots: IntArray, posterior_of_runs: Posterior) -> None:
         """Keep the last judgement, and where each robot then was, for whoever asks for words."""
-        window, zero, self._latest = self._tracker.window, self._zero or 0.0, {}
+        window, zero = self._tracker.window, self._zero or 0.0
         for at, robot in enumerate(robots.tolist()):
             begin_s, older = float(window.zero_s[robot]) + zero, int(window.forgotten[robot])
             self._latest[robot] = posterior_of_runs, at, StreamPosition(begin_s, older)
@@ -435,7 +436,7 @@ class StreamingFleet:
         for robot in robots:
             self._tracker.see_on_way(int(robot), int(window.count[robot]) - 1)
         # The way takes long to judge, so that robots of which it does not count are apart.
-        on_way = self._on_way(robots)
+        on_way, self._latest = self._on_way(robots), {}
         for group in (robots[on_way], robots[~on_way]):
             if len(group) == 0:
                 continue
