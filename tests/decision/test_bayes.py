@@ -230,15 +230,9 @@ def test_hypotheses_may_be_few(twin, few):
     found = BayesDiagnoser(twin, hypotheses=two, priors=known).diagnose(few)
     assert list(found[0].posterior) == ["healthy", "motor_3:stuck"]
     share = whole[:, [0, 3]] / whole[:, [0, 3]].sum(axis=1, keepdims=True)
-    told = [
-        i
-        for i, (d, of_all) in enumerate(zip(found, of_nine, strict=True))
-        if d.diagnosis is not None and of_all.diagnosis is not None
-    ]
-    assert len(told) >= 12
-    apart = np.abs(posteriors(found)[told] - share[told]).max(axis=1)
-    assert (apart < 1e-6).sum() >= len(told) - 2
-    assert apart.max() < 0.02  # runs that hardly rest, by rows that come near the best
+    told = whole[:, [0, 3]].sum(axis=1) > 1e-5  # of two that are excluded only few rows are weighed
+    assert told.sum() >= 6
+    np.testing.assert_allclose(posteriors(found)[told], share[told], rtol=0, atol=1e-4)
 
 
 def test_a_single_hypothesis_is_certain(twin, few):

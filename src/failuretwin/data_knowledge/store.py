@@ -298,7 +298,7 @@ def sole_writer(path: Path, patience_s: float = 0.0) -> Iterator[None]:
         raise OutputError(f"{path}: lock {file} cannot be made ({error.strerror}).") from error
     try:
         with suppress(OSError):  # on a full disk it goes without a name
-            file.write_text(f"process {os.getpid()} on {socket.gethostname()}")
+            file.write_bytes(f"process {os.getpid()} on {socket.gethostname()}".encode())
         yield
     finally:
         with suppress(OSError):  # before letting go: nobody can lock a file that has no name

@@ -432,6 +432,8 @@ class StreamingFleet:
 
     def _judge(self, robots: IntArray, weigh: Weigh = compute_posterior) -> IntArray:
         """Renew what is believed of robots by what their last movements say."""
+        if len(robots) == 0:
+            return robots
         window, beliefs = self._tracker.window, self._beliefs
         for robot in robots:
             self._tracker.see_on_way(int(robot), int(window.count[robot]) - 1)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.core.numerics import log_of
+from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.settling import sag
 from failuretwin.failure_behavior.fault import Arrival
@@ -28,9 +28,13 @@ from failuretwin.inference.engine.theta import columns
 from failuretwin.inference.faults.fault_sizes import SizePrior, coarse_sizes
 from failuretwin.inference.faults.priors import OnsetIntervals, plateau_or_ramp
 
-Angle = Callable[[FloatArray, int], FloatArray]
-"""Angle of the motor at some amounts if this or that outcome of the commands is what happened,
-(run, row, node) -> (run, row, moment, node) [rad]."""
+Angle = Callable[[FloatArray, IntArray], FloatArray]
+"""Angle of the motor at some amounts under outcomes of the commands,
+(run, row, node), (run, row, moment) -> (run, row, moment, node) [rad]."""
+ARRIVED = np.zeros((1, 1, 1), dtype=np.int64)
+"""The first outcome of each moment: every command arrives."""
+CHEBYSHEV = 9
+"""Amounts at which what is expected is computed; between them it is interpolated."""
 GRID = 61
 """Held angles among which the best is looked for."""
 FREE_RAD = 0.08
@@ -75,41 +79,68 @@ class _Motor:
             found[self.motor] = self.scene.model.held_scatter[self.motor] ** 2
         return found
 
-    def best(self, grid: FloatArray, alike: bool) -> FloatArray:
-        """Return the amount of each row that explains its moments best, (run, row).
+    def best(self, grid: FloatArray, alike: bool) -> tuple[FloatArray, IntArray]:
+        """Return the amount of each row that explains its moments best, and their outcomes.
+
+        What is expected is interpolated between a few amounts. The scale is that of the first
+        outcome: all commands arrive.
 
         Args:
-            grid: Amounts to look at, (run, node).
+            grid: Amounts to look at, (run, node), spaced alike in all runs.
             alike: Whether the angle does not depend on the row.
+
+        Returns:
+            Amounts (run, row) and outcomes (run, row, moment).
         """
-        scene, rows = self.scene, len(self.first)
-        shape = (len(grid), 1 if alike else rows, grid.shape[1])
-        angle = self.angle(np.broadcast_to(grid[:, None], shape), 0)
-        step = np.abs(np.diff(angle, axis=-1)).mean(axis=-1, keepdims=True)
-        error, jacobian, _ = self._residual(angle)
+        moments, says = self.scene.moments, list[FloatArray]()
+        nodes, between = _chebyshev(grid)
+        nodes = np.repeat(nodes[:, None], 1 if alike else len(self.first), axis=1)
+        point = np.moveaxis(moments.point, -1, 0)[:, :, None, :, None]
+        precision = log_determinant = np.zeros(0)
+        for a in range(min(1 + len(self.variance), moments.base.shape[2])):
+            expected, jacobian, angle = self._expected(nodes, np.full((1, 1, 1), a))
+            if a == 0:
+                precision, log_determinant = self._precision(between, jacobian, angle)
+            error = point - np.moveaxis(expected, -1, 0) @ between.T
+            square = symmetric.dot(error, symmetric.times(precision, error))
+            weight = moments.log_weight[:, None, :, None, a]
+            says.append(weight + self.scene.noise.log_density(square, log_determinant))
+        density = np.stack(says)
+        whole = np.logaddexp(log_sum(density, axis=0), self.scene.noise.log_outlier)
+        whole = np.where(self._counts[..., None], whole, 0.0).sum(axis=2)  # (run, row, node)
+        at = whole.argmax(axis=-1)[..., None]
+        outcome = density.argmax(axis=0)
+        outcome = np.broadcast_to(outcome, (*self._counts.shape, outcome.shape[-1]))
+        found = np.take_along_axis(np.broadcast_to(grid[:, None], whole.shape), at, axis=2)
+        return found[..., 0], np.take_along_axis(outcome, at[..., None], axis=3)[..., 0]
+
+    def _precision(
+        self, between: FloatArray, jacobian: FloatArray, angle: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return inverse scale (packed) and its log determinant at each amount of a grid."""
+        jacobian = np.einsum("nk,brmkcj->brmncj", between, jacobian, optimize=True)
+        step = np.abs(np.diff(angle @ between.T, axis=-1)).mean(axis=-1, keepdims=True)
         variance = np.broadcast_to(self.variance, jacobian[..., 0, :].shape).copy()
         variance[..., self.motor] += step**2 / 6.0
         scale = np.matmul(jacobian * variance[..., None, :], np.swapaxes(jacobian, -1, -2))
-        precision, log_determinant = symmetric.inverse(
-            packed(scale + self._doubt[:, None, :, None])
-        )
-        error = np.moveaxis(error, -1, 0)
-        square = symmetric.dot(error, symmetric.times(precision, error))
-        says = np.logaddexp(
-            scene.noise.log_density(square, log_determinant), scene.noise.log_outlier
-        )
-        says = np.where(self._counts[:, :, :, None], says, 0.0).sum(axis=2)
-        return np.take_along_axis(
-            np.broadcast_to(grid[:, None], says.shape), says.argmax(-1)[..., None], 2
-        )[..., 0]
+        return symmetric.inverse(packed(scale + self._doubt[:, None, :, None]))
 
-    def refined(self, x: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-        """Return amounts (run, row) after some Gauss-Newton steps, within (run, 1) limits."""
+    def refined(
+        self, found: tuple[FloatArray, IntArray], low: FloatArray, high: FloatArray
+    ) -> FloatArray:
+        """Return amounts (run, row) after some Gauss-Newton steps.
+
+        Args:
+            found: Amounts and outcomes to begin with.
+            low: Least amount, (run, 1).
+            high: Largest, same axes.
+        """
+        x, outcome = found
         for _ in range(STEPS):
-            angle = self.angle(x[..., None], 0)
-            slope = self.slope(x)
-            error, jacobian, _ = self._residual(angle)
-            error, jacobian = error[:, :, :, 0], jacobian[:, :, :, 0]
+            slope = self.slope(x, outcome)
+            expected, jacobian, _ = self._expected(x[..., None], outcome)
+            error = self.scene.moments.point[:, None] - expected[:, :, :, 0]
+            jacobian = jacobian[:, :, :, 0]
             scale = np.matmul(jacobian * self.variance, np.swapaxes(jacobian, -1, -2))
             precision = unpacked(symmetric.inverse(packed(scale + self._doubt[:, None]))[0])
             lever = jacobian[..., self.motor] * slope[..., None]
@@ -123,10 +154,10 @@ class _Motor:
             x = np.clip(x, low, high)
         return x
 
-    def slope(self, x: FloatArray) -> FloatArray:
+    def slope(self, x: FloatArray, outcome: IntArray) -> FloatArray:
         """Return dphi/dx, (run, row, moment)."""
         step = 1e-4
-        low, high = (self.angle((x + h)[..., None], 0)[..., 0] for h in (-step, step))
+        low, high = (self.angle((x + h)[..., None], outcome)[..., 0] for h in (-step, step))
         return (high - low) / (2.0 * step)
 
     @property
@@ -141,13 +172,20 @@ class _Motor:
         usable = self.scene.moments.usable[:, None]
         return usable & (np.arange(usable.shape[2]) >= self.first[:, None])
 
-    def _residual(self, angle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return residual, Jacobian and pose with the motor at angles (run, row, moment, node)."""
-        settled = self.scene.settled[:, None, :, None]
+    def _expected(
+        self, x: FloatArray, outcome: IntArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return what the sensors show at some amounts, its Jacobian, and the motor's angle.
+
+        Args:
+            x: (run, row, node).
+            outcome: Of each moment, (run, row, moment) or axes that spread to them.
+        """
+        angle = self.angle(x, outcome)
+        settled = taken(self.scene.pose, outcome)[..., None, :]
         pose = np.broadcast_to(settled, (*angle.shape, settled.shape[-1])).copy()
         pose[..., self.motor] = angle
-        expected, jacobian = self.scene.model.sensors.expected(pose)
-        return self.scene.moments.point[:, None, :, None] - expected, jacobian, pose
+        return *self.scene.model.sensors.expected(pose), angle
 
     def rows(
         self,
@@ -169,7 +207,7 @@ class _Motor:
         scene, moments, motor = self.scene, self.scene.moments, self.motor
         base = np.repeat(moments.base[:, None], x.shape[1], axis=1)
         for a in range(base.shape[3]):
-            angle = self.angle(x[..., None], a)[..., 0]  # (run, row, moment)
+            angle = self.angle(x[..., None], np.full((1, 1, 1), a))[..., 0]  # (run, row, moment)
             if self.held:
                 base[..., a, motor] = angle
             else:  # off where each outcome of the commands leads
@@ -195,13 +233,36 @@ class _Motor:
             weight,
             np.arange(weight.shape[-1]),
             G,
-            jacobian[..., motor] * self.slope(x)[..., None],
+            jacobian[..., motor] * self.slope(x, ARRIVED)[..., None],
             x,
             variance,
             amount_prior,
             onsets=sampled(*onsets),
         )
         return before_onset(rows, scene.healthy, scene.columns)
+
+
+def taken(values: FloatArray, outcome: IntArray) -> FloatArray:
+    """Return the values (run, moment, outcome, motor) of some outcomes, (run, row, moment, motor).
+
+    Args:
+        values: Of all outcomes.
+        outcome: Of each moment, (run, row, moment) or axes that spread to them.
+    """
+    at = np.broadcast_to(outcome, np.broadcast_shapes(outcome.shape, (len(values), 1, 1)))
+    at = np.broadcast_to(at, (*at.shape[:2], values.shape[1]))
+    return np.take_along_axis(values[:, None], at[..., None, None], axis=3)[..., 0, :]
+
+
+def _chebyshev(grid: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return amounts to interpolate between, (run, k), and their weights at a grid, (node, k)."""
+    chebyshev = np.polynomial.chebyshev
+    low, high = grid[:, :1], grid[:, -1:]
+    points = chebyshev.chebpts2(CHEBYSHEV)
+    at = 2.0 * (grid[0] - low[0]) / (high[0] - low[0]) - 1.0
+    degree = CHEBYSHEV - 1
+    between = chebyshev.chebvander(at, degree) @ np.linalg.inv(chebyshev.chebvander(points, degree))
+    return low + 0.5 * (points + 1.0) * (high - low), between
 
 
 # A motor that is held.
@@ -223,8 +284,8 @@ def held_rows(scene: Scene, motor: int) -> Rows:
     first = np.repeat(np.arange(count), 2)
     moving = _Motor(scene, motor, True, _held_angle(count), first)
     later = _Motor(scene, motor, True, _held_angle(count), np.arange(count))
-    free = later.best(np.linspace(low, high, GRID, axis=1), alike=True)
-    free = later.refined(free, low[:, None], high[:, None])
+    best = later.best(np.linspace(low, high, GRID, axis=1), alike=True)
+    free = later.refined(best, low[:, None], high[:, None])
     log_prior = np.stack(
         [
             log_of(weight[..., 0]) + np.log1p(-share),
@@ -261,7 +322,7 @@ def _flat(plateau: FloatArray, ramp: FloatArray) -> FloatArray:
 
 
 def _held_angle(count: int) -> Angle:
-    def angle(x: FloatArray, outcome: int) -> FloatArray:
+    def angle(x: FloatArray, outcome: IntArray) -> FloatArray:
         del outcome
         return np.repeat(x[:, :, None], count, axis=2)
 
@@ -345,9 +406,9 @@ def offset_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
     grid = np.concatenate([-grid[::-1], grid]) if mode.signed else grid
     grid = np.tile(grid, (scene.moments.runs, 1))
     least = -high if mode.signed else low
-    x = moving.best(grid, alike=not growing)
-    x = moving.refined(x, np.full((1, 1), least), np.full((1, 1), high))
-    slope = np.sqrt(np.mean(moving.slope(x) ** 2, axis=-1))
+    best = moving.best(grid, alike=not growing)
+    x = moving.refined(best, np.full((1, 1), least), np.full((1, 1), high))
+    slope = np.sqrt(np.mean(moving.slope(x, ARRIVED) ** 2, axis=-1))
     deviation = np.minimum(FREE_RAD / np.maximum(slope, 1e-6), 0.5 * high)
     prior = _size_prior(sizes, mode.signed)
     return moving.rows(x, deviation**2, log_prior, prior, (onsets, shares))
@@ -372,19 +433,19 @@ def _offset_angle(scene: Scene, motor: int, mode: FaultMode, since: FloatArray) 
     travel = np.abs(moments.target - moments.origin)[..., motor]
     compliance, payload = np.asarray(model.settling.compliance), model.settling.payload
 
-    def angle(x: FloatArray, outcome: int) -> FloatArray:
-        settled = scene.pose[:, :, outcome]
+    def angle(x: FloatArray, outcome: IntArray) -> FloatArray:
+        settled = taken(scene.pose, outcome)
         target, direction = (
-            values[:, :, outcome, motor] for values in (moments.base, moments.direction)
+            taken(values, outcome)[..., motor] for values in (moments.base, moments.direction)
         )
         load = np.zeros_like(target)
         if mode.needs_compliance:
             load = sag(model.twin.robot, settled, compliance, payload)[..., motor]
-        parts = (target - direction * travel, target, direction, load)
-        origin, goal, way, weight = (part[:, None, :, None] for part in parts)
+        parts = (target - direction * travel[:, None], target, direction, load)
+        origin, goal, way, weight = (part[..., None] for part in parts)
         arrival = Arrival(origin, goal, way, since[..., None], weight)
         off = mode.settled_offset(x[:, :, None], arrival)
-        return settled[:, None, :, motor, None] + off
+        return settled[..., motor, None] + off
 
     return angle
 
