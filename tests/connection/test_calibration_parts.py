@@ -172,7 +172,7 @@ def test_what_never_or_always_happened_may_never_or_always_happen():
     assert Rate(0, 0).interval == (0.0, 1.0)
 
 
-def test_lost_commands_are_counted_by_set_of_motors_and_lateness(settle):
+def test_lost_commands_are_counted_by_set_of_motors_and_lateness(settle, armpi):
     seen = settle(TYPICAL, seed=1, movements=10)
     near = np.abs(seen.target - seen.origin) < 0.1
     lost = np.zeros((10, 4), dtype=bool)
@@ -181,7 +181,7 @@ def test_lost_commands_are_counted_by_set_of_motors_and_lateness(settle):
     punctual = ~delayed
     punctual[1, 4] = False  # of the last movement nobody knows
     lost[9] = True
-    found = {loss.motors: loss for loss in loss_rates(seen, lost, punctual, delayed, NAMES)}
+    found = {loss.motors: loss for loss in loss_rates(seen, lost, punctual, delayed, armpi)}
     assert set(found) == {("motor_1", "motor_2"), tuple(NAMES), *((name,) for name in NAMES)}
     first = found["motor_1",]
     assert (first.late.hits, first.punctual.hits) == (1, 1)
@@ -191,6 +191,9 @@ def test_lost_commands_are_counted_by_set_of_motors_and_lateness(settle):
     assert (both.late.hits, both.punctual.hits) == (1, 0)
     assert found["motor_3",].late.hits == found["motor_3",].punctual.hits == 0
     assert found[tuple(NAMES)].punctual.hits == 0
+    trials = both.punctual.trials  # hobby servos lose both commands of a pair once in 200 movements
+    assert both.punctual.mean == pytest.approx(30 * 0.005 / (trials + 30))
+    assert both.late.mean == pytest.approx((1 + 2 * both.punctual.mean) / (both.late.trials + 2))
 
 
 # Late starts, gaps, glitches
@@ -290,7 +293,7 @@ def test_a_motor_that_hardly_had_to_move_lost_nothing(armpi):
     pose[::3, 0] = angles[:-1][::3, 0]
     part = fit_settling(observed(armpi, angles, pose))
     assert not part.sorted.lost[:, 0].any()
-    rates = loss_rates(part.observations, part.sorted.lost, *np.ones((2, 12, 5), dtype=bool), NAMES)
+    rates = loss_rates(part.observations, part.sorted.lost, *np.ones((2, 12, 5), dtype=bool), armpi)
     assert all(rate.punctual.hits == 0 for rate in rates)
 
 

@@ -141,9 +141,7 @@ def fit_calibration(
             part = fit_settling(part.observations.of(model))
     movements = movements_of(kept)
     late = lateness(movements)
-    losses = loss_rates(
-        part.observations, part.sorted.lost, late.punctual, late.delayed, robot.motor_names
-    )
+    losses = loss_rates(part.observations, part.sorted.lost, late.punctual, late.delayed, robot)
     timing = fit_timing(transients(kept, movements, late, part, part.settling, robot), robot)
     gaps = gap_starts(kept, movements, late.late)
     glitches = glitch_rates(kept) if part.observations.of_motors else None

@@ -24,7 +24,7 @@ from failuretwin.digital_model.arm_classes import class_of
 from failuretwin.digital_model.nonidealities import LostCommand, Range, Readings, Schedule, Timing
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import largest_load
-from failuretwin.inference.together.habits import HEAVIEST
+from failuretwin.inference.together.habits import HEAVIEST, RATE_COUNT
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -40,20 +40,24 @@ PRIOR_MOVEMENTS = 2.0
 
 @dataclass(frozen=True)
 class Rate:
-    """A share estimated from a count.
+    """A share estimated from a count, with a Beta prior: the Jeffreys prior, or what is usual.
 
     Attributes:
         hits: How often it happened.
         trials: Out of how many.
+        usual: Mean of the prior [-].
+        weight: Trials that the prior counts for.
     """
 
     hits: int
     trials: int
+    usual: float = 0.5
+    weight: float = 1.0
 
     @property
     def mean(self) -> float:
-        """Posterior mean with the Jeffreys prior [-]."""
-        return (self.hits + 0.5) / (self.trials + 1.0)
+        """Posterior mean [-]."""
+        return (self.hits + self.weight * self.usual) / (self.trials + self.weight)
 
     @property
     def identified(self) -> bool:
@@ -96,13 +100,8 @@ class LossRates:
     late: Rate
 
     def entry(self) -> LostCommand:
-        """Return it as a value of the digital model.
-
-        Where few movements were late, the punctual ones say what they can.
-        """
-        punctual = self.punctual.mean if self.punctual.trials else 0.0
-        late = (self.late.hits + PRIOR_MOVEMENTS * punctual) / (self.late.trials + PRIOR_MOVEMENTS)
-        return LostCommand(self.motors, punctual, late)
+        """Return it as a value of the digital model."""
+        return LostCommand(self.motors, self.punctual.mean, self.late.mean)
 
 
 def loss_rates(
@@ -110,18 +109,20 @@ def loss_rates(
     lost: BoolArray,
     punctual: BoolArray,
     delayed: BoolArray,
-    names: list[str],
+    robot: Robot,
 ) -> list[LossRates]:
     """Return the rate of each single motor, and of each set that was seen to go together.
+
+    Before any log the punctual rate is that of the arm's class, and the late one is the punctual.
 
     Args:
         observations: Settled movements.
         lost: Motors that stayed, (movement, motor).
         punctual: Movements that started on time, (run, movement).
         delayed: Movements that started late, (run, movement); what is neither does not count.
-        names: Names of the motors.
+        robot: The arm.
     """
-    at = observations.at
+    at, names, kind = observations.at, robot.motor_names, class_of(robot)
     seen = {tuple(np.flatnonzero(row).tolist()) for row in lost if row.any()}
     single = {(motor,) for motor in range(len(names))}
     rates = []
@@ -132,11 +133,14 @@ def loss_rates(
         # A motor that is told to stay cannot be seen to lose a command.
         travel = np.abs(observations.target - observations.origin)[:, chosen].min(axis=1)
         told = travel > TRAVEL_RAD
-        counts = [
-            Rate(int(np.sum(exactly & told & kind)), int(np.sum(told & kind)))
-            for kind in (punctual[at], delayed[at])
-        ]
-        rates.append(LossRates(tuple(names[m] for m in members), counts[0], counts[1]))
+        usual = kind.lost if len(members) == 1 else kind.lost_together
+        on_time, late = (
+            (int(np.sum(exactly & told & some)), int(np.sum(told & some)))
+            for some in (punctual[at], delayed[at])
+        )
+        rate = Rate(*on_time, usual, RATE_COUNT)
+        lost_late = Rate(*late, rate.mean, PRIOR_MOVEMENTS)
+        rates.append(LossRates(tuple(names[m] for m in members), rate, lost_late))
     return rates
 
 

@@ -24,6 +24,8 @@ from failuretwin.inference.together.habits import Habits
 
 LEAST_TOLD = 1e-3
 """What is less probable is not asked for scatter and losses."""
+SHOWN = 4.0
+"""Travel of a motor, in its scatter, from which a lost command shows."""
 LEAST_LIKELY = 1e-8
 """What is less probable is not weighed again before the last pass over the runs."""
 
@@ -120,7 +122,11 @@ class Judged:
     def _losses(
         self, entry: LostCommand, hypothesis: Hypothesis, part: ThetaPart, outcomes: FloatArray
     ) -> FloatArray:
-        """Return how often some motors lose a command, punctual and late, (pick, 2, 2)."""
+        """Return how often some motors lose a command, punctual and late, (pick, 2, 2).
+
+        Of movements in which all of them travel; a motor that hardly does shows no loss, so that
+        those of the others count without it.
+        """
         likelihood, run = self.weighing.likelihood, part.picks.run
         names, late = likelihood.model.motor_names, likelihood.late
         lost = np.isin(names, entry.motors)
@@ -129,10 +135,15 @@ class Judged:
         if (lost & faulty).any():
             return told
         patterns = self.weighing.evidence.scene.model.lost_commands.lost
-        hit = (patterns[:, ~faulty] == lost[~faulty]).all(axis=1)
+        movements, model = likelihood.evidence.movements, likelihood.model
+        travel = np.abs(movements.target - movements.origin())[run]  # (pick, movement, motor)
+        travels = travel > SHOWN * model.scatter
+        shown = patterns & travels[:, :, None]
+        hit = (shown[..., ~faulty] == lost[~faulty]).all(axis=-1)
+        counts = travels[..., lost].all(axis=-1)
         for k, kind in enumerate((1.0 - late[run], late[run])):
-            told[:, k, 0] = (outcomes[..., hit].sum(axis=-1) * kind).sum(axis=1)
-            told[:, k, 1] = (outcomes.sum(axis=-1) * kind).sum(axis=1)
+            told[:, k, 0] = (np.where(hit, outcomes, 0.0).sum(axis=-1) * kind * counts).sum(axis=1)
+            told[:, k, 1] = (outcomes.sum(axis=-1) * kind * counts).sum(axis=1)
         return told
 
 
