@@ -51,6 +51,26 @@ class FilterRows:
     variance: FloatArray
     noise: Noise
 
+    @classmethod
+    def joined(cls, parts: Sequence[FilterRows]) -> FilterRows:
+        """Return several sets of rows as one."""
+        if len(parts) == 1:
+            return parts[0]
+
+        def join(name: str) -> FloatArray:
+            return np.concatenate([getattr(one, name) for one in parts])
+
+        return cls(
+            lambda m: Mixture.joined([one.mixture_at(m) for one in parts]),
+            np.concatenate([one.usable for one in parts]),
+            join("kept"),
+            join("mean"),
+            join("covariance"),
+            join("lever"),
+            join("variance"),
+            parts[0].noise,
+        )
+
     @property
     def prior(self) -> tuple[FloatArray, FloatArray]:
         """Mean (row, number) and covariance (row, number, number) of f and, last, z."""
@@ -130,8 +150,23 @@ class RowsPosterior:
     @classmethod
     def joined(cls, parts: Sequence[RowsPosterior]) -> RowsPosterior:
         """Return the posteriors of several sets of rows as one."""
+        if len(parts) == 1:
+            return parts[0]
+        most = max(one.share.shape[-1] for one in parts)
+        same = [one.with_outcomes(most) for one in parts]
         names = [field.name for field in fields(cls)]
-        return cls(*(np.concatenate([getattr(one, n) for one in parts]) for n in names))
+        return cls(*(np.concatenate([getattr(one, n) for one in same]) for n in names))
+
+    def with_outcomes(self, count: int) -> RowsPosterior:
+        """Return the same with more outcomes, which weigh nothing, or without such ones."""
+        more = count - self.share.shape[-1]
+        if more <= 0:
+            share, log_weight = self.share[..., :count], self.log_weight[..., :count]
+        else:
+            behind = [(0, 0), (0, 0), (0, more)]
+            share = np.pad(self.share, behind)
+            log_weight = np.pad(self.log_weight, behind, constant_values=-np.inf)
+        return replace(self, share=share, log_weight=log_weight)
 
 
 def filter_rows(rows: FilterRows) -> RowsPosterior:
@@ -182,6 +217,24 @@ def filter_rows(rows: FilterRows) -> RowsPosterior:
         f[:, size:],
         whole[:, size:, size:],
     )
+
+
+def filter_together(
+    parts: Sequence[FilterRows], before: Sequence[RowsPosterior] | None, outcomes: Sequence[int]
+) -> list[RowsPosterior]:
+    """Return what moments say of several sets of rows, all at once.
+
+    Args:
+        parts: The sets.
+        before: What the filter has found, to weigh every moment again given all others; None: the
+            filter finds it.
+        outcomes: Of each set.
+    """
+    rows = FilterRows.joined(parts)
+    found = filter_rows(rows) if before is None else refine(rows, RowsPosterior.joined(before))
+    ends = np.cumsum([len(one.usable) for one in parts]).tolist()
+    places = [slice(*pair) for pair in zip([0, *ends[:-1]], ends, strict=True)]
+    return [found[at].with_outcomes(n) for at, n in zip(places, outcomes, strict=True)]
 
 
 def _carried(

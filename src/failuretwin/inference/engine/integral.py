@@ -19,7 +19,8 @@ Section: docs/inference.md#integral
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -109,6 +110,27 @@ class Mixture:
         if len(rows) == self.log_weight.shape[-1]:  # all of them
             return self
         return Mixture(self.residual[..., rows], self.scale[..., rows], self.log_weight[:, rows])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Mixture]) -> Mixture:
+        """Return the rows of several mixtures as one; outcomes that a row has not weigh nothing."""
+        if len(parts) == 1:
+            return parts[0]
+        most = max(len(one.log_weight) for one in parts)
+        padded = [one._padded(most - len(one.log_weight)) for one in parts]
+        names = [field.name for field in fields(cls)]
+        return cls(*(np.concatenate([getattr(one, n) for one in padded], -1) for n in names))
+
+    def _padded(self, more: int) -> Mixture:
+        """Return the same with more outcomes, as the last one, that weigh nothing."""
+        if more == 0:
+            return self
+        last = [(0, 0), (0, more), (0, 0)]
+        return Mixture(
+            np.pad(self.residual, last, mode="edge"),
+            np.pad(self.scale, last, mode="edge"),
+            np.pad(self.log_weight, last[1:], constant_values=-np.inf),
+        )
 
     @property
     def by_row(self) -> tuple[FloatArray, FloatArray]:

@@ -11,7 +11,7 @@ Section: docs/inference.md#runs
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,7 +23,7 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.amount_rows import held_rows, offset_rows
-from failuretwin.inference.engine.filter import RowsPosterior, filter_rows, refine
+from failuretwin.inference.engine.filter import RowsPosterior, filter_together
 from failuretwin.inference.engine.picks import Part, Picks, Prepared, narrowed, prepared
 from failuretwin.inference.engine.redrawn_rows import redrawn_rows
 from failuretwin.inference.engine.rows import Rows, Scene
@@ -78,6 +78,35 @@ class Weighed:
 
 CHUNK = 1000
 """Picks that are weighed at a time."""
+ALIKE = 2.0
+"""Hypotheses are weighed together whose rows have at most so many times as many outcomes."""
+
+
+def _batches(sizes: Sequence[int], outcomes: Sequence[int]) -> Iterator[list[tuple[int, slice]]]:
+    """Yield rows of hypotheses to weigh at a time: some of hypothesis and place.
+
+    Args:
+        sizes: How many rows of each hypothesis.
+        outcomes: How many outcomes these have.
+    """
+    batch, count, least = list[tuple[int, slice]](), 0, 0
+    for h in sorted(range(len(sizes)), key=lambda h: outcomes[h]):
+        for at in range(0, max(sizes[h], 1), CHUNK):
+            some = min(CHUNK, sizes[h] - at)
+            if batch and (count + some > CHUNK or outcomes[h] > ALIKE * least):
+                yield batch
+                batch, count = [], 0
+            if not batch:
+                least = outcomes[h]
+            batch.append((h, slice(at, at + some)))
+            count += some
+    yield batch
+
+
+def _by_components(picks: Picks, run: IntArray, component: IntArray) -> Picks:
+    """Return rows of a hypothesis by some components of their runs."""
+    pick, of = np.nonzero(picks.run[:, None] == run)
+    return Picks(picks.run[pick], picks.row[pick], component[of])
 
 
 def has_rows(hypothesis: Hypothesis) -> bool:
@@ -137,33 +166,25 @@ class RunsEvidence:
     @cached_property
     def weighed(self) -> list[Weighed]:
         """What the rows of each hypothesis say, by the components that weigh them."""
-        first = [self.weigh(h, self._all_rows(h)) for h in range(len(self.rows))]
+        every = range(len(self.rows))
+        first = self.weigh([self._all_rows(h) for h in every])
         kept = [self._narrow(h, one) for h, one in enumerate(first)]
         wanted = self._wanted(first)
         widest = self._widest(wanted)
         runs = np.arange(len(wanted))
-        begun = [self._of_components(h, kept[h], runs, widest) for h in range(len(kept))]
+        begun = self.weigh([_by_components(kept[h], runs, widest) for h in every])
         others = wanted.copy()
         others[runs, widest] = False
         near = self._near(begun)
-        found = []
-        for h, one in enumerate(begun):
-            run, component = np.nonzero(others & near[:, h, None])
-            others_say = self._of_components(h, kept[h], run, component)
-            found.append(Weighed.joined([one, others_say]))
-        return self._refined(found)
+        more = [np.nonzero(others & near[:, h, None]) for h in every]
+        says = self.weigh([_by_components(kept[h], *more[h]) for h in every])
+        return self._refined([Weighed.joined(pair) for pair in zip(begun, says, strict=True)])
 
     def _widest(self, wanted: BoolArray) -> IntArray:
         """Return the component with the largest scatter that weighs each run, (run,)."""
         order = np.lexsort((self.components.noise_m, self.components.sigma))
         rank = np.argsort(order)
         return np.asarray(np.argmax(np.where(wanted, rank, -1), axis=1))
-
-    def _of_components(self, h: int, picks: Picks, run: IntArray, component: IntArray) -> Weighed:
-        """Return what rows of a hypothesis say by some components of their runs."""
-        pick, of = np.nonzero(picks.run[:, None] == run)
-        some = Picks(picks.run[pick], picks.row[pick], component[of])
-        return self.weigh(h, some)
 
     def _near(self, found: Sequence[Weighed]) -> BoolArray:
         """Return the hypotheses that may come near the best of each run, (run, hypothesis).
@@ -186,12 +207,11 @@ class RunsEvidence:
         best = np.full(self.scene.moments.runs, -np.inf)
         for one, height in zip(found, says, strict=True):
             np.maximum.at(best, one.picks.run, height)
-        refined = []
-        for h, (one, height) in enumerate(zip(found, says, strict=True)):
-            near = np.flatnonzero(height > best[one.picks.run] - REFINED_NATS)
-            again = self.weigh(h, one.picks[near], one.found[near])
-            refined.append(one.with_picks(near, again))
-        return refined
+        pairs = zip(found, says, strict=True)
+        near = [np.flatnonzero(h > best[one.picks.run] - REFINED_NATS) for one, h in pairs]
+        some = list(zip(found, near, strict=True))
+        again = self.weigh([one.picks[i] for one, i in some], [one.found[i] for one, i in some])
+        return [one.with_picks(i, new) for (one, i), new in zip(some, again, strict=True)]
 
     @cached_property
     def log_evidence(self) -> FloatArray:
@@ -261,33 +281,44 @@ class RunsEvidence:
         asked[np.arange(runs), others.argmax(axis=1)] = True
         asked &= np.isfinite(says)
         table = np.full((runs, count, len(first)), -np.inf)
-        for h in np.flatnonzero(asked.any(axis=0)).tolist():
+        picks = []
+        for h in range(len(first)):
             some = np.repeat(np.flatnonzero(asked[:, h]), count)
             component = np.tile(np.arange(count), len(some) // count)
-            part = self.weigh(h, Picks(some, row[some, h], component))
-            says_of = part.log_evidence + self.components.weight(some, component)
-            table[some, component, h] = says_of + self.log_odds[h]
+            picks.append(Picks(some, row[some, h], component))
+        for h, part in enumerate(self.weigh(picks)):
+            at = part.picks.run, part.picks.component
+            says_of = part.log_evidence + self.components.weight(*at)
+            table[*at, h] = says_of + self.log_odds[h]
         near = table > table.max(axis=1, keepdims=True) - COMPONENT_NATS
         return np.asarray(found | (near & np.isfinite(table)).any(axis=2))
 
-    def weigh(self, h: int, picks: Picks, before: RowsPosterior | None = None) -> Weighed:
-        """Return what some rows say.
+    def weigh(
+        self, picks: Sequence[Picks], before: Sequence[RowsPosterior] | None = None
+    ) -> list[Weighed]:
+        """Return what some rows of each hypothesis say.
 
         Args:
-            h: Index of the hypothesis.
-            picks: The rows.
+            picks: The rows of each hypothesis.
             before: What the filter has found, to weigh every moment again given all others; None:
                 the filter finds it.
         """
-        chunks = [slice(at, at + CHUNK) for at in range(0, max(len(picks.run), 1), CHUNK)]
-        parts = [
-            self._weigh(h, picks[some], None if before is None else before[some]) for some in chunks
-        ]
-        return Weighed.joined(parts)
+        outcomes = [one.residual.shape[3] for one in self.prepared]
+        found: list[list[RowsPosterior]] = [[] for _ in picks]
+        for batch in _batches([len(some.run) for some in picks], outcomes):
+            says = filter_together(
+                [self.part(h, picks[h][at]).filter_rows for h, at in batch],
+                None if before is None else [before[h][at] for h, at in batch],
+                [outcomes[h] for h, _ in batch],
+            )
+            for (h, _), one in zip(batch, says, strict=True):
+                found[h].append(one)
+        parts = [RowsPosterior.joined(one) for one in found]
+        return [self._weighed(h, *one) for h, one in enumerate(zip(picks, parts, strict=True))]
 
-    def _weigh(self, h: int, picks: Picks, before: RowsPosterior | None) -> Weighed:
-        rows, ready = self.rows[h], self.part(h, picks).filter_rows
-        found = filter_rows(ready) if before is None else refine(ready, before)
+    def _weighed(self, h: int, picks: Picks, found: RowsPosterior) -> Weighed:
+        """Return what rows of a hypothesis say, with the prior of rows and amounts."""
+        rows = self.rows[h]
         total = found.total + rows.log_prior[picks.run, picks.row]
         if h in self.left_out:
             total = total + self.left_out[h][picks.run]
