@@ -16,9 +16,10 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import as_floats
-from failuretwin.inference.engine.registration import sensor_in_doubt
-from failuretwin.inference.engine.weighing import ALLOWED_FOR
+from failuretwin.core.types import IntArray, as_floats
+from failuretwin.inference.engine.registration import robot_parts, sensor_in_doubt
+from failuretwin.inference.engine.runs import has_rows
+from failuretwin.inference.engine.weighing import ALLOWED_FOR, Weighing
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import FITS, run_misfit
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -128,17 +129,30 @@ class SeenRuns:
     @cached_property
     def sample(self) -> RunLikelihood:
         """Some of the runs by their settled positions; on the way where none rests."""
+        return RunLikelihood(self.settled.alike(self.sampled), self.healthy)
+
+    @cached_property
+    def sampled(self) -> IntArray:
+        """Indices of these runs."""
         moving = self.settled.on_the_way
         rows = np.flatnonzero(~moving) if not moving.all() else np.arange(len(moving))
         some = np.unique(np.linspace(0, len(rows) - 1, JUDGED_RUNS).astype(np.int64))
-        return RunLikelihood(self.settled.alike(rows[some]), self.healthy)
+        return np.asarray(rows[some])
+
+    @cached_property
+    def weighed_sample(self) -> list[Weighing]:
+        """These runs weighed, by a sensor that stands where the profile says."""
+        if not any(has_rows(h) for h in self.hypotheses):
+            return []
+        return robot_parts(self.sample, self.hypotheses, self.priors)
 
     @cached_property
     def in_doubt(self) -> bool:
         """Whether the sensor may stand a little elsewhere than the profile says, by any robot."""
-        return all(
-            sensor_in_doubt(replace(self.sample, model=one.model), self.hypotheses, self.priors)
-            for one in robot_components(self.healthy, self.priors)[:2]
+        others = self.components[1:2]
+        asked = self.hypotheses, self.priors
+        return sensor_in_doubt(self.sample, *asked, self.weighed_sample) and all(
+            sensor_in_doubt(replace(self.sample, model=one.model), *asked) for one in others
         )
 
     @cached_property
@@ -194,9 +208,10 @@ class SeenRuns:
             moving: Readings on the way of all runs; None: they are left aside.
         """
         way = None if moving is None else moving[rows]
-        all_runs = np.arange(len(self.settled.usable))
-        likelihood = RunLikelihood(self.settled.alike(all_runs[rows]), self.healthy, way)
-        return shared_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt)
+        some = np.arange(len(self.settled.usable))[rows]
+        likelihood = RunLikelihood(self.settled.alike(some), self.healthy, way)
+        known = self.weighed_sample if np.array_equal(some, self.sampled) else ()
+        return shared_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt, known)
 
     def robots(self, named: Posterior, common: Sequence[str], others: bool) -> RobotMixture:
         """Return what runs say of the robot: that of the model, or another of its kind.

@@ -162,7 +162,10 @@ def registered_together(
 
 
 def sensor_in_doubt(
-    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+    likelihood: RunLikelihood,
+    hypotheses: Sequence[Hypothesis],
+    priors: Priors,
+    known: Sequence[Weighing] = (),
 ) -> bool:
     """Return whether runs that share a set-up say that the sensor may be displaced.
 
@@ -172,14 +175,16 @@ def sensor_in_doubt(
         likelihood: Some of the runs, as they were seen.
         hypotheses: What may be the case.
         priors: Beliefs about faults and set-ups.
+        known: The same runs weighed, where they were (`robot_parts`).
     """
     ranked = [h for h in hypotheses if has_rows(h)]
     if priors.setup.doubt == 0.0 or not ranked or not likelihood.model.sensors.tool_alone:
         return False
     settled = replace(likelihood, moving=None)
     told = [*ranked, *(h for h in hypotheses if len(h.faults) > 1)]
-    found = robot_posterior(settled, told, priors).log_posterior
-    best = np.argmax(found, axis=1)
+    parts = known or robot_parts(settled, told, priors)
+    columns = [list(parts[0].hypotheses).index(h) for h in told]
+    best = np.argmax(np.concatenate([one.log_joint_at_rest[:, columns] for one in parts]), axis=1)
     single = np.flatnonzero(best < len(ranked))
     return bool(len(single)) and _suspect(settled[single], ranked, priors, best[single])
 
@@ -220,11 +225,24 @@ columns of all rows and outcomes stay below 100 MB."""
 
 
 def robot_posterior(
-    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+    likelihood: RunLikelihood,
+    hypotheses: Sequence[Hypothesis],
+    priors: Priors,
+    known: Sequence[Weighing] = (),
 ) -> Posterior:
-    """Return the posterior of runs whose sensor is where the profile says."""
+    """Return the posterior of runs whose sensor is where the profile says.
+
+    Args:
+        likelihood: The runs as they were seen.
+        hypotheses: What may be the case.
+        priors: Beliefs about faults and set-ups.
+        known: The same runs weighed by where they rest, where they were (`robot_parts`).
+    """
     chunks = _chunks(likelihood)
-    parts = _robot_parts(likelihood, hypotheses, priors)
+    parts = known or robot_parts(likelihood, hypotheses, priors)
+    if known and likelihood.moving is not None:
+        pairs = zip(known, chunks, strict=True)
+        parts = [one.seen_moving(likelihood.moving[rows]) for one, rows in pairs]
     return assembled(likelihood, [one.posterior() for one in parts], *_in_turn(chunks))
 
 
@@ -232,7 +250,7 @@ def robot_evidence(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> FloatArray:
     """Return log p(run | h) of runs whose sensor is where the profile says, (run, hypothesis)."""
-    parts = _robot_parts(likelihood, hypotheses, priors)
+    parts = robot_parts(likelihood, hypotheses, priors)
     return np.concatenate([one.by_hypothesis for one in parts])
 
 
@@ -247,9 +265,10 @@ def evidence_at_once(
     return np.stack([one.log_evidence for one in says], axis=1)
 
 
-def _robot_parts(
+def robot_parts(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> list[Weighing]:
+    """Return runs whose sensor is where the profile says, in chunks."""
     chunks = _chunks(likelihood)
     return [robot_weighing(likelihood[rows], hypotheses, priors) for rows in chunks]
 

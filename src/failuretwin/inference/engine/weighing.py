@@ -32,6 +32,7 @@ from failuretwin.inference.engine.theta import REGISTRATION, Components, Layout
 from failuretwin.inference.faults.marginal import MarginalLikelihood
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import TransientSamples
 from failuretwin.inference.posterior import Posterior, log_prior, marginal_likelihoods
 from failuretwin.inference.set_ups.set_ups import odd_zero
 from failuretwin.inference.theta.shared_unknowns import (
@@ -61,6 +62,7 @@ class Weighing:
         place: Registration about which each run is expanded, (run, 7).
         asked: Hypotheses with rows that are weighed, (run, hypothesis); None: all.
         spread: V by which rows are centred, (theta, theta); None: that of the first component.
+        known: What the runs say of the hypotheses with rows, where that was found before.
     """
 
     likelihood: RunLikelihood
@@ -71,6 +73,12 @@ class Weighing:
     place: FloatArray
     asked: BoolArray | None = None
     spread: FloatArray | None = None
+    known: RunsEvidence | None = None
+
+    def seen_moving(self, moving: TransientSamples) -> Weighing:
+        """Return the same runs with readings on the way beside where they rest."""
+        likelihood = replace(self.likelihood, moving=moving)
+        return replace(self, likelihood=likelihood, known=self.evidence)
 
     @cached_property
     def log_odds(self) -> FloatArray:
@@ -85,6 +93,8 @@ class Weighing:
     @cached_property
     def evidence(self) -> RunsEvidence:
         """What the runs say of the hypotheses with rows."""
+        if self.known is not None:
+            return self.known
         model = self.likelihood.model
         seen = registered_evidence(self.likelihood.evidence, self.place, model.sensors)
         scene = Scene.of(
@@ -155,6 +165,11 @@ class Weighing:
         return np.asarray(table)
 
     @property
+    def log_joint_at_rest(self) -> FloatArray:
+        """Log p(h) p(run | h) by settled positions alone, (run, hypothesis)."""
+        return np.asarray(log_sum(self._log_settled, axis=1) + self.log_odds)
+
+    @property
     def by_hypothesis(self) -> FloatArray:
         """Log p(run | h), (run, hypothesis)."""
         return log_sum(self.log_evidence, axis=1)
@@ -186,7 +201,7 @@ class Weighing:
             self.weights(),
             self.remarks,
             self.odd_zeros,
-            log_settled=log_sum(log_sum(self._log_settled, axis=1) + self.log_odds, axis=1),
+            log_settled=log_sum(self.log_joint_at_rest, axis=1),
         )
 
     @cached_property

@@ -12,14 +12,18 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.inference.engine.registration import displaced_posterior, robot_posterior
 from failuretwin.inference.engine.runs import has_rows
-from failuretwin.inference.engine.weighing import assembled
+from failuretwin.inference.engine.weighing import Weighing, assembled
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.posterior import Posterior, compute_posterior
 
 
 def shared_posterior(
-    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors, in_doubt: bool
+    likelihood: RunLikelihood,
+    hypotheses: Sequence[Hypothesis],
+    priors: Priors,
+    in_doubt: bool,
+    known: Sequence[Weighing] = (),
 ) -> Posterior:
     """Weigh every hypothesis by some runs, what they share integrated out.
 
@@ -30,6 +34,7 @@ def shared_posterior(
         hypotheses: What may be the case.
         priors: Beliefs about faults and set-ups.
         in_doubt: Whether their sensor may be displaced.
+        known: The same runs weighed by where they rest, with a sensor that is not, where they were.
     """
     moving = likelihood.evidence.on_the_way
     if moving.any() and not moving.all():
@@ -43,4 +48,4 @@ def shared_posterior(
         return compute_posterior(likelihood, hypotheses, priors)
     if in_doubt:
         return displaced_posterior(likelihood, hypotheses, priors)
-    return robot_posterior(likelihood, hypotheses, priors)
+    return robot_posterior(likelihood, hypotheses, priors, known)
