@@ -81,8 +81,11 @@ class PostgresServer:
         self.stop()
         shutil.rmtree(self.folder)
 
-    def database(self):
-        """Make an empty database and return its URL."""
+    def place(self):
+        """Make an empty database and return a place for a store."""
+        return PostgresPlace(self, self._database())
+
+    def _database(self):
         self._databases += 1
         name = f"store_{self._databases}"
         self.run("createdb", "-h", self.folder, "-U", USER, name)
@@ -93,3 +96,17 @@ class PostgresServer:
         name = url.partition("@/")[2].partition("?")[0]
         words = ("-h", self.folder, "-U", USER, "-d", name, "-At", "-v", "ON_ERROR_STOP=1")
         return self.run("psql", *words, "-c", statement).splitlines()
+
+
+class PostgresPlace:
+    """A database for a store, and SQL by `psql`."""
+
+    engine = "postgresql"
+
+    def __init__(self, server, url):
+        self.url = url
+        self.server = server
+
+    def sql(self, statement):
+        """Run SQL and return rows of texts; an empty text is null."""
+        return [tuple(row.split("|")) for row in self.server.sql(self.url, statement)]

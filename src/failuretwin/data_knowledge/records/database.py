@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,6 +15,7 @@ from sqlalchemy.pool import NullPool
 from failuretwin import __version__
 from failuretwin.core.errors import InputError, OutputError, needs_extra, one_line
 from failuretwin.data_knowledge.records import migrations
+from failuretwin.data_knowledge.records.schema import storable
 from failuretwin.data_knowledge.store import PATIENCE_S, check_writable
 
 EXPECTED = "Expected the path of an SQLite file or postgresql://USER@HOST/DATABASE."
@@ -38,6 +40,11 @@ CAUSES = (
         ("readonly", "read-only", "permission denied"),
         "it cannot be written",
         "Allow writing to it and its folder, or choose another store.",
+    ),
+    (
+        ("unable to open",),
+        "it cannot be opened",
+        "Check that the file and its folder can be read and written.",
     ),
     (
         ("not a database", "malformed"),
@@ -89,8 +96,12 @@ class Database:
         self.name = str(self.file or _shown(parsed))
         with needs_extra("stores on PostgreSQL need psycopg", "store"):
             self._engine = sa.create_engine(
-                parsed, poolclass=NullPool, connect_args=_arguments(parsed)
+                parsed,
+                poolclass=NullPool,
+                connect_args=_arguments(parsed),
+                json_serializer=_json,
             )
+        self._one_state = {} if sqlite else {"isolation_level": "REPEATABLE READ"}
         if sqlite:
             sa.event.listen(self._engine, "connect", _set_up_sqlite)
             sa.event.listen(self._engine, "begin", _begin_sqlite)
@@ -103,8 +114,10 @@ class Database:
             InputError: If the database fails.
         """
         try:
-            with self._engine.connect() as connection, connection.begin():
-                yield connection
+            with self._engine.connect() as plain:
+                connection = plain.execution_options(**self._one_state)
+                with connection.begin():
+                    yield connection
         except SQLAlchemyError as error:
             raise InputError(self._in_words(error, "")) from error
 
@@ -128,8 +141,10 @@ class Database:
         for words, meaning, fix in CAUSES:
             if any(word in text.lower() for word in words):
                 return f"{self.name}: {meaning} ({one_line(text)}).{end} {fix}"
-        place = "the file" if self.file else "that the server runs, and user, password and database"
-        return f"{self.name}: {one_line(text).rstrip('.?')}.{end} Check {place}, then run the command again."
+        server = "that the server runs, and user, password and database"
+        place = "the file" if self.file else server
+        said = one_line(text).rstrip(".?")
+        return f"{self.name}: {said}.{end} Check {place}, then run the command again."
 
     # The schema.
 
@@ -219,6 +234,10 @@ class Database:
                 f"does not know (its own is {migrations.HEAD}). Install a newer failuretwin."
             )
         return revision
+
+
+def _json(value: Any) -> str:
+    return storable(json.dumps(value, ensure_ascii=False))
 
 
 def _shown(url: sa.URL) -> str:

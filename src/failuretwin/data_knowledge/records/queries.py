@@ -10,6 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from failuretwin.core.errors import check_name
+from failuretwin.data_knowledge.records import CHECK_DAYS
 from failuretwin.data_knowledge.records.episodes import CONFIRMED
 from failuretwin.data_knowledge.records.history import OTHER_CAUSE, WRONG
 from failuretwin.data_knowledge.records.schema import (
@@ -22,8 +23,6 @@ from failuretwin.data_knowledge.records.schema import (
     robots,
 )
 
-CHECK_DAYS = 30.0
-"""Time without a run after which a robot is due for a check [days]."""
 DAY_S = 86_400.0
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ from failuretwin import __version__
 from failuretwin.core.errors import InputError, check_name
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.runs import measured_rate
-from failuretwin.data_knowledge.records import migrations, schema, writing
+from failuretwin.data_knowledge.records import CHECK_DAYS, migrations, schema, writing
 from failuretwin.data_knowledge.records.database import Database
 from failuretwin.data_knowledge.records.episodes import CONFIRMED
 from failuretwin.data_knowledge.records.export import export_parquet
@@ -38,7 +38,7 @@ from failuretwin.data_knowledge.records.history import (
     read_history,
 )
 from failuretwin.data_knowledge.records.log_files import LogFile, log_file, utc
-from failuretwin.data_knowledge.records.queries import CHECK_DAYS, QueryAnswer, ask
+from failuretwin.data_knowledge.records.queries import QueryAnswer, ask
 from failuretwin.data_knowledge.records.schema import (
     calibrations,
     episodes,
@@ -388,10 +388,20 @@ Kept = list[tuple[Diagnosis, int, str]]
 """Diagnoses with the row of their run and their digest."""
 
 
+CLOCK_ERROR = timedelta(days=1)
+"""Largest lead of the clock that logs are stamped by."""
+
+
 def _reference(log: LogFile | str | Path | None) -> LogFile:
     if log is None:
         return LogFile("", None, 0, datetime.now(UTC))
-    return log if isinstance(log, LogFile) else log_file(log)
+    found = log if isinstance(log, LogFile) else log_file(log)
+    if found.recorded > datetime.now(UTC) + CLOCK_ERROR:
+        raise InputError(
+            f"{found.path}: its time, {found.recorded:%Y-%m-%d %H:%M}, lies in the future, so all "
+            "later logs would count as older. State the right one: --recorded TIME."
+        )
+    return found
 
 
 def _or_now(time: datetime | None) -> datetime:

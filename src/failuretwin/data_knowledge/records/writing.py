@@ -199,7 +199,7 @@ def diagnosis_row(diagnosis: Diagnosis, digest: str, at: datetime) -> dict[str, 
         "magnitude_high": size[1],
         "verdict": diagnosis.verdict,
         "undecided": diagnosis.undecided,
-        "quality": list(diagnosis.quality),
+        "quality": [storable(line) for line in diagnosis.quality],
         "digest": digest,
     }
 
