@@ -75,6 +75,10 @@ judged = (
     .subquery()
 )
 """Episodes with the finding that stands; null where there is none."""
+_of_the_robot = diagnoses.c.robot_id == kinds.c.robot_id
+FIRST_RUN = sa.select(sa.func.min(diagnoses.c.at)).where(_of_the_robot).scalar_subquery()
+LAST_RUN = sa.select(sa.func.max(diagnoses.c.at)).where(_of_the_robot).scalar_subquery()
+"""Times of the first and last run of each robot of `kinds`: one look into the index each."""
 REFUTED = judged.c.verdict.in_([WRONG, OTHER_CAUSE]).is_(True)
 
 
@@ -120,15 +124,9 @@ def _between(days: float, failures: int) -> float | None:
 
 def _watched_days(connection: sa.Connection) -> dict[str, tuple[int, float]]:
     """Return the number of robots of each kind, and the time they were watched in all [days]."""
-    first, last = sa.func.min(diagnoses.c.at), sa.func.max(diagnoses.c.at)
-    query = (
-        sa.select(kinds.c.kind, sa.type_coerce(first, diagnoses.c.at.type))
-        .add_columns(sa.type_coerce(last, diagnoses.c.at.type))
-        .join(kinds, kinds.c.robot_id == diagnoses.c.robot_id)
-        .group_by(diagnoses.c.robot_id, kinds.c.kind)
-    )
+    query = sa.select(kinds.c.kind, FIRST_RUN, LAST_RUN)
     found: dict[str, tuple[int, float]] = {}
-    for kind, begin, end in connection.execute(query):
+    for kind, begin, end in connection.execute(query.where(FIRST_RUN.is_not(None))):
         count, days = found.get(kind, (0, 0.0))
         found[kind] = (count + 1, round(days + (end - begin).total_seconds() / DAY_S, 3))
     return found
@@ -152,13 +150,7 @@ def _wrong(connection: sa.Connection, now: datetime, days: float) -> list[tuple[
 
 
 def _due(connection: sa.Connection, now: datetime, days: float) -> list[tuple[Any, ...]]:
-    last = sa.func.max(diagnoses.c.at)
-    query = (
-        sa.select(kinds.c.robot_id, kinds.c.robot, sa.type_coerce(last, diagnoses.c.at.type))
-        .outerjoin(diagnoses, diagnoses.c.robot_id == kinds.c.robot_id)
-        .group_by(kinds.c.robot_id, kinds.c.robot)
-        .order_by(kinds.c.robot)
-    )
+    query = sa.select(kinds.c.robot_id, kinds.c.robot, LAST_RUN).order_by(kinds.c.robot)
     is_open = sa.select(judged.c.robot_id).where(judged.c.until.is_(None), ~REFUTED)
     faulty = set(connection.scalars(is_open))
     in_force = sa.select(calibrations.c.robot_id).where(calibrations.c.valid_to.is_(None))
