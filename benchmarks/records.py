@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ def main() -> None:
         last = f"arm_{options.robots - 1}"
         report("history", options.calls, lambda: ft.open_store(url).history(last))
         for name in QUESTIONS:
-            report(name, options.calls, lambda name=name: ft.open_store(url).query(name))
+            report(name, options.calls, partial(answered, url, name))
         begun = time.perf_counter()
         rows = sum(store.export(Path(folder) / "tables").values())
         print(f"export: {rows / (time.perf_counter() - begun):,.0f} rows a second")
@@ -90,6 +91,11 @@ def day(rng: np.random.Generator, motors: list[str]) -> list[ft.Diagnosis]:
         table = dict(zip(names, posterior.tolist(), strict=True))
         found.append(ft.Diagnosis(f"run_{run}", table, onset_s=0.5, verdict=f"{names[true]}, 99 %"))
     return found
+
+
+def answered(url: str, question: str) -> object:
+    """Return the answer to a question from a store that has just been opened."""
+    return ft.open_store(url).query(question)
 
 
 def stored_bytes(url: str) -> int:

@@ -70,7 +70,7 @@ def test_diagnoses_are_remembered_with_their_log(run, store, rows, tmp_path):
     assert "remembered in robots.db: 0 runs of arm_7, 3 known before\n" in again
     assert rows("SELECT count(*) FROM diagnoses") == [(3,)]
     log.write_text("another")
-    assert "log.csv: has changed since" in run("store", "check", *store, code=2, folder=None)
+    assert "log.csv: has changed since" in run("store", "check", *store, code=2)
 
 
 def test_each_run_belongs_to_its_log(run, store, rows, tmp_path):
@@ -127,12 +127,14 @@ def test_the_calibration_of_the_store_is_used_where_none_is_named(
     told = run("calibrate", "healthy.nc", "--out", "mine.toml", *words)
     assert "remembered in robots.db: calibration mine of arm_7" in told
     assert rows("SELECT document FROM calibrations") == [((tmp_path / "mine.toml").read_text(),)]
-    by_store = failuretwin("diagnose", SAMPLE, *words, "--csv", "a.csv", folder=tmp_path)
+    save_run_set(ft.read_runs(SAMPLE).isel(run=[0]), tmp_path / "log.nc")
+    log = ("log.nc", "--hypotheses", "healthy,motor_3:stuck")
+    by_store = failuretwin("diagnose", *log, *words, "--csv", "a.csv", folder=tmp_path)
     assert "calibration of arm_7 from the store: mine, valid from" in by_store.stderr
-    run("diagnose", SAMPLE, "--calibration", "mine.toml", "--csv", "b.csv")
+    run("diagnose", *log, "--calibration", "mine.toml", "--csv", "b.csv")
     assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
     assert rows("SELECT calibration_id, method LIKE '%mine%' FROM sessions") == [(1, 1)]
-    named = failuretwin("diagnose", SAMPLE, *words, "--calibration", "none", folder=tmp_path)
+    named = failuretwin("diagnose", *log, *words, "--calibration", "none", folder=tmp_path)
     assert "from the store" not in named.stderr
     assert rows("SELECT calibration_id FROM sessions ORDER BY id") == [(1,), (None,)]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -30,38 +30,37 @@ from failuretwin.digital_model.robot import Robot
 if TYPE_CHECKING:
     import xarray as xr
 
-    from failuretwin.app.commands.options import LogOptions, RobotOptions, StoreOptions
-
 
 class DiagnosisKeeper:
     """Keeps the diagnoses of one command, log by log.
 
     Args:
         store: The store.
-        memory: Name of the robot.
-        reading: The logs.
+        logs: The logs.
+        read: Returns the runs of each log as a run set of its own.
+        robot_name: Name of the robot; None: that of its profile.
         recorded: When they were recorded (UTC); None: when each was last modified.
     """
 
     def __init__(
-        self, store: Store, memory: StoreOptions, reading: LogOptions, recorded: datetime | None
+        self,
+        store: Store,
+        logs: Sequence[Path],
+        read: Callable[[Robot], list[xr.Dataset]],
+        robot_name: str | None,
+        recorded: datetime | None,
     ) -> None:
         self._store = store
-        self._memory = memory
-        self._reading = reading
+        self._logs = logs
+        self._read = read
+        self._robot_name = robot_name
         self._recorded = recorded
         self._parts: list[xr.Dataset] = []
         self._calibration: StoredCalibration | None = None
 
-    def calibrated(self, options: RobotOptions) -> CalibratedRobot | None:
-        """Return the robot with its calibration of the store, and say so.
-
-        None: the store has none, or the user names another calibration.
-        """
-        if options.calibration is not None:
-            return None
-        robot = options.model
-        name = self._memory.name_of(robot)
+    def calibrated(self, robot: Robot) -> CalibratedRobot | None:
+        """Return the robot with its calibration of the store, and say so; None: it has none."""
+        name = self._robot_name or robot.name
         stored = self._calibration = self._store.calibration(name)
         if stored is None:
             return None
@@ -72,15 +71,15 @@ class DiagnosisKeeper:
 
     def runs(self, robot: Robot) -> xr.Dataset:
         """Return the runs of all logs as one run set."""
-        self._parts = self._reading.parts(robot)
+        self._parts = self._read(robot)
         return concatenate(self._parts)
 
     def remember(self, diagnoses: Sequence[Diagnosis], robot: Robot) -> list[str]:
         """Store the diagnoses of all runs, and return what was stored, in lines."""
-        name, rest = self._memory.name_of(robot), list(diagnoses)
+        name, rest = self._robot_name or robot.name, list(diagnoses)
         added = known = 0
         changed: dict[int, FaultEpisode] = {}
-        for log, part in zip(self._reading.logs, self._parts, strict=True):
+        for log, part in zip(self._logs, self._parts, strict=True):
             names = map(str, part["run"].values)
             own = [replace(one, run=run) for run, one in zip(names, rest, strict=False)]
             del rest[: len(own)]

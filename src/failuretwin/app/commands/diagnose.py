@@ -15,6 +15,8 @@ from failuretwin.app.terminal import show, tell
 from failuretwin.core.errors import InputError
 
 if TYPE_CHECKING:
+    from failuretwin.app.records import DiagnosisKeeper
+    from failuretwin.digital_model.calibrated_robot import CalibratedRobot
     from failuretwin.inference.together.fault_course import FaultCourse
 
 BAYES_ONLY = (
@@ -136,8 +138,7 @@ def diagnose(
     offsets.check_correctable(reading.logs, correct)
     calibration, together = robot.calibration, track or self_calibrate
     keeper = memory.keeper(reading, recorded)
-    stored = None if keeper is None or together else keeper.calibrated(robot)
-    known = stored or robot.known
+    known = _known(keeper, robot, together)
     bayes = ft.BayesDiagnoser(
         known.twin,
         imperfections=known.imperfections,
@@ -180,6 +181,16 @@ def diagnose(
     show(*offsets.offset_lines(runs, known, diagnoses, reading, correct))
     if keeper is not None:
         show("", *keeper.remember(diagnoses, robot.model))
+
+
+def _known(
+    keeper: DiagnosisKeeper | None, robot: opt.RobotOptions, learning: bool
+) -> CalibratedRobot:
+    """Return the robot as calibrated by `--calibration`, or in the store where none is named."""
+    stored = None
+    if keeper is not None and robot.calibration is None and not learning:
+        stored = keeper.calibrated(robot.model)
+    return stored or robot.known
 
 
 def _write(

@@ -244,7 +244,7 @@ class StoreOptions:
             return None
         from failuretwin.app.records import DiagnosisKeeper
 
-        return DiagnosisKeeper(store, self, reading, recorded)
+        return DiagnosisKeeper(store, reading.logs, reading.parts, self.robot_name, recorded)
 
     def name_of(self, robot: ft.Robot) -> str:
         """Return the name of this robot in the store."""
