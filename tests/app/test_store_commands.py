@@ -70,7 +70,7 @@ def test_diagnoses_are_remembered_with_their_log(run, store, rows, tmp_path):
     assert "remembered in robots.db: 0 runs of arm_7, 3 known before\n" in again
     assert rows("SELECT count(*) FROM diagnoses") == [(3,)]
     log.write_text("another")
-    assert "log.csv: has changed since" in run("store", "check", *store, code=2)
+    assert "robots.db: 1 problem. Expected" in run("store", "check", *store, code=2)
 
 
 def test_each_run_belongs_to_its_log(run, store, rows, tmp_path):

@@ -183,7 +183,8 @@ diagnoses = sa.Table(
     _needed("undecided", Text),
     _needed("quality", Json),
     _needed("digest", Text),
-    sa.Index("ix_diagnoses_robot", "robot_id", "at", "state"),
+    sa.Index("ix_diagnoses_robot", "robot_id", "at"),
+    sa.Index("ix_diagnoses_state", "robot_id", "state"),
 )
 """Diagnoses of runs; intervals hold 90 %, `magnitude` is in the unit of its fault mode."""
 

@@ -102,7 +102,8 @@ def _diagnoses() -> None:
         *_needed(TEXT, "digest"),
     )
     op.create_index("ix_diagnoses_run_id", "diagnoses", ["run_id"])
-    op.create_index("ix_diagnoses_robot", "diagnoses", ["robot_id", "at", "state"])
+    op.create_index("ix_diagnoses_robot", "diagnoses", ["robot_id", "at"])
+    op.create_index("ix_diagnoses_state", "diagnoses", ["robot_id", "state"])
 
 
 def _episodes() -> None:
