@@ -23,7 +23,7 @@ links: .venv/docs
 
 # Runs the pages, writes into them what their code prints now, and draws what is drawn from code.
 pages: .venv/ready
-	$(BIN)/python docs/executed.py docs/tutorials/*.md docs/contributing/*.md docs/reference/*.md
+	$(BIN)/python docs/executed.py docs/store.md docs/tutorials/*.md docs/contributing/*.md docs/reference/*.md
 	$(BIN)/python docs/diagram.py
 	$(BIN)/python docs/notebooks.py
 

@@ -12,7 +12,9 @@ from failuretwin import DigitalTwin, load_robot
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
 from failuretwin.digital_model.calibrated_robot import load_calibration
+from postgres_server import PostgresServer
 from roscores import Roscore, need_ros
+from store_places import SqlitePlace
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell ignores Ctrl-C for what it runs in the background, and children would inherit that;
@@ -110,3 +112,20 @@ def roscore(tmp_path_factory):
             patch.setitem(os.environ, name, core.environment[name])
         yield core
     core.stop()
+
+
+@pytest.fixture(scope="session")
+def postgres():
+    """A PostgreSQL server of its own."""
+    server = PostgresServer()
+    server.start()
+    yield server
+    server.close()
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def place(request, tmp_path):
+    """A place for a store on each engine: its URL, and SQL by the engine's own program."""
+    if request.param == "sqlite":
+        return SqlitePlace(tmp_path / "robots.db")
+    return request.getfixturevalue("postgres").place()

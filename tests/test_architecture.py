@@ -25,6 +25,7 @@ ROOMS = (
 
 EXTRAS = {
     *(
+        "alembic",
         "dask",
         "distributed",
         "matplotlib",
@@ -33,7 +34,9 @@ EXTRAS = {
         "pyarrow",
         "rosbags",
         "roslibpy",
+        "psycopg",
         "rospy",
+        "sqlalchemy",
     ),
     *("sklearn", "torch"),
 }

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from failuretwin.core.runs import run_set
     from failuretwin.data_knowledge.generate import Plan, iterate, simulate
     from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs, sample_log
+    from failuretwin.data_knowledge.records.store import Store, open_store
     from failuretwin.decision.acting.reach import reach
     from failuretwin.decision.acting.session import act
     from failuretwin.decision.acting.task import Target, Task
@@ -87,6 +88,7 @@ _HOME = {
     "Sink": "connection.links.base",
     "SizedMode": "failure_behavior.mode",
     "Source": "connection.links.base",
+    "Store": "data_knowledge.records.store",
     "StreamingDiagnoser": "decision.streaming.diagnoser",
     "StreamingFleet": "decision.streaming.fleet",
     "Target": "decision.acting.task",
@@ -105,6 +107,7 @@ _HOME = {
     "load_network": "decision.learned.storage",
     "load_robot": "digital_model.robot",
     "monitor": "decision.streaming.monitor",
+    "open_store": "data_knowledge.records.store",
     "reach": "decision.acting.reach",
     "read_results": "decision.results",
     "read_runs": "data_knowledge.readers.read",
@@ -148,6 +151,7 @@ __all__ = [
     "Sink",
     "SizedMode",
     "Source",
+    "Store",
     "StreamingDiagnoser",
     "StreamingFleet",
     "Target",
@@ -167,6 +171,7 @@ __all__ = [
     "load_network",
     "load_robot",
     "monitor",
+    "open_store",
     "reach",
     "read_results",
     "read_runs",
@@ -181,18 +186,23 @@ __all__ = [
 ]
 
 
-_LEARNING = ("load_network", "train")
-"""Names that need the extra `learn` as soon as they are used."""
+_EXTRAS = {
+    "Store": ("the store needs SQLAlchemy and alembic", "store"),
+    "load_network": ("networks need PyTorch and scikit-learn", "learn"),
+    "open_store": ("the store needs SQLAlchemy and alembic", "store"),
+    "train": ("networks need PyTorch and scikit-learn", "learn"),
+}
+"""Names that need an extra as soon as they are used: the libraries, and the extra."""
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'failuretwin' has no attribute {name!r}")
-    if name not in _LEARNING:
+    if name not in _EXTRAS:
         return _loaded(name)
     from failuretwin.core.errors import needs_extra
 
-    with needs_extra("networks need PyTorch and scikit-learn", "learn"):
+    with needs_extra(*_EXTRAS[name]):
         return _loaded(name)
 
 

@@ -21,6 +21,7 @@ from failuretwin.app.commands.doctor import doctor
 from failuretwin.app.commands.learn import calibrate, study, train
 from failuretwin.app.commands.live import emulate, watch
 from failuretwin.app.commands.results import advise, evaluate
+from failuretwin.app.commands.store import found, history, query, repaired, store
 from failuretwin.app.terminal import tell
 from failuretwin.core.errors import FailureTwinError
 
@@ -43,7 +44,7 @@ def cli() -> None:
 for command in (
     *(demo, import_, doctor, simulate, diagnose, evaluate, calibrate),
     *(train, study, emulate, watch, act, stop, reach, check, design, isolability),
-    *(advise, robot),
+    *(advise, robot, store, history, found, repaired, query),
 ):
     cli.add_command(command)
 

@@ -154,7 +154,24 @@ def load_calibration(
     if str(name_or_path) == "none":
         return CalibratedRobot(robot, NO_IMPERFECTIONS)
     path = _file_of(str(name_or_path or robot.name), robot)
-    table = read_toml(path)
+    return calibration_from_table(read_toml(path), robot, path)
+
+
+def calibration_from_table(
+    table: dict[str, Any], robot: Robot, path: Path | str
+) -> CalibratedRobot:
+    """Return a robot with the calibration of a TOML table.
+
+    Args:
+        table: Contents of a calibration file.
+        robot: The robot.
+        path: File or place of the table, for texts.
+
+    Raises:
+        InputError: If the table is no calibration, belongs to another robot or does not fit its
+            motors.
+    """
+    table = dict(table)
     record = _record(table.pop(CALIBRATION_TABLE, {}), path)
     if record.robot not in ("", robot.name):
         raise InputError(
@@ -201,7 +218,7 @@ friction and scatter, such as 7 deg: assumed, ten times that of hobby servos. Fa
 healthy motor is indistinguishable from a stuck one."""
 
 
-def _check_sane(settling: Settling | None, robot: Robot, path: Path) -> None:
+def _check_sane(settling: Settling | None, robot: Robot, path: Path | str) -> None:
     """Raise InputError unless the settled errors of a file are those of a healthy robot."""
     if settling is None:
         return
@@ -235,7 +252,7 @@ class _Record:
         return with_own.seen_from(self.frame)
 
 
-def _record(table: object, path: Path) -> _Record:
+def _record(table: object, path: Path | str) -> _Record:
     if not isinstance(table, dict):
         raise InputError(f"{path}: {CALIBRATION_TABLE} is {table!r}, expected a table.")
     known = {name: table[name] for name in ("robot", "loops", "frame") if name in table}

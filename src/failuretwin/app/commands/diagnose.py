@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -10,6 +13,11 @@ import failuretwin as ft
 from failuretwin.app.commands import options as opt
 from failuretwin.app.terminal import show, tell
 from failuretwin.core.errors import InputError
+
+if TYPE_CHECKING:
+    from failuretwin.app.records import DiagnosisKeeper
+    from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+    from failuretwin.inference.together.fault_course import FaultCourse
 
 BAYES_ONLY = (
     *("calibration", "track", "self_calibrate", "hypotheses"),
@@ -87,6 +95,8 @@ LEARNING = ("out", "independent")
     "by a zero that has moved. Only those joints of `observation.state` and its statistics "
     "change; `action` never does, nor does a stuck motor.",
 )
+@opt.store_options
+@opt.recorded_option
 @opt.reading_options
 @opt.plugin_option
 @opt.calibrated_robot_options()
@@ -105,6 +115,8 @@ def diagnose(
     csv_file: Path | None,
     report: Path | None,
     correct: Path | None,
+    recorded: datetime | None,
+    memory: opt.StoreOptions,
     reading: opt.LogOptions,
     robot: opt.RobotOptions,
 ) -> None:
@@ -119,13 +131,14 @@ def diagnose(
     from failuretwin.app.reports import reports
     from failuretwin.app.reports.isolability_report import isolability_summary
     from failuretwin.app.reports.technician_page import write_report
-    from failuretwin.decision.results import write_csv, write_json_lines
     from failuretwin.decision.robot_state import course_of, robot_state
     from failuretwin.inference.faults.priors import priors_of
     from failuretwin.inference.observation.sensors import TOOL_ALONE, sensing_of
 
     offsets.check_correctable(reading.logs, correct)
-    known, calibration = robot.known, robot.calibration
+    calibration, together = robot.calibration, track or self_calibrate
+    keeper = memory.keeper(reading, recorded)
+    known = _known(keeper, robot, together)
     bayes = ft.BayesDiagnoser(
         known.twin,
         imperfections=known.imperfections,
@@ -135,9 +148,8 @@ def diagnose(
     )
     _refuse_unused(method == given.BAYES, track, self_calibrate)
     diagnoser = given.chosen_diagnoser(method, bayes)
-    together = track or self_calibrate
     history = learning.opened_history(bayes, calibration, out) if track else None
-    runs = reading.runs(known.robot)
+    runs = reading.runs(known.robot) if keeper is None else keeper.runs(known.robot)
     sensed = sensing_of(runs, sensing)
     given.warn_mismatch(runs, given.expected_name(diagnoser))
     if together:
@@ -154,10 +166,7 @@ def diagnose(
         tell(learning.ruled_out_note(runs, found.bayes, diagnoses, usual), err=True)
     course = course_of(diagnoses, found.bayes) if together and not independent else None
     state = robot_state(diagnoses, known.robot, course, found.remarks if together else None)
-    if json_file is not None:
-        write_json_lines(diagnoses, json_file, course)
-    if csv_file is not None:
-        write_csv(diagnoses, csv_file, course)
+    _write(diagnoses, course, json_file, csv_file)
     if report is not None:
         write_report(runs, diagnoses, known.twin, state, report, found.sections)
         tell(f"the page: {report / 'index.html'}", err=True)
@@ -170,6 +179,33 @@ def diagnose(
     last = [*reports.course_lines(course, state, known.robot), *found.lines]
     show(*([""] if last else []), *last)
     show(*offsets.offset_lines(runs, known, diagnoses, reading, correct))
+    if keeper is not None:
+        show("", *keeper.remember(diagnoses, robot.model))
+
+
+def _known(
+    keeper: DiagnosisKeeper | None, robot: opt.RobotOptions, learning: bool
+) -> CalibratedRobot:
+    """Return the robot as calibrated by `--calibration`, or in the store where none is named."""
+    stored = None
+    if keeper is not None and robot.calibration is None and not learning:
+        stored = keeper.calibrated(robot.model)
+    return stored or robot.known
+
+
+def _write(
+    diagnoses: Sequence[ft.Diagnosis],
+    course: FaultCourse | None,
+    json_file: Path | None,
+    csv_file: Path | None,
+) -> None:
+    """Write the diagnoses, with the fault course over all runs if there is one."""
+    from failuretwin.decision.results import write_csv, write_json_lines
+
+    if json_file is not None:
+        write_json_lines(diagnoses, json_file, course)
+    if csv_file is not None:
+        write_csv(diagnoses, csv_file, course)
 
 
 def _refuse_unused(bayes: bool, track: bool, self_calibrate: bool) -> None:

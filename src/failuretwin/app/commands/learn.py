@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     "Each LOG is a calibration of another robot of the kind: write their mean and spread, the "
     "prior of an uncalibrated robot.",
 )
+@opt.store_options
 @opt.reading_options
 @opt.robot_options
 def calibrate(
@@ -40,6 +41,7 @@ def calibrate(
     name: str | None,
     report: Path | None,
     pool: bool,
+    memory: opt.StoreOptions,
     reading: opt.LogOptions,
     robot: opt.RobotOptions,
 ) -> None:
@@ -61,8 +63,10 @@ def calibrate(
     if pool:
         if hold_out is not None or report is not None:
             raise click.UsageError("--pool reads no logs. Leave out --hold-out and --report.")
+        opt.refuse_unused("a population is not one robot", "store", "robot_name")
         _pool(reading.logs, out, name, robot)
         return
+    store = memory.opened()
     tests, others = step_parameters.split_step_tests(reading.logs, reading.columns)
     steps = step_parameters.learn_loops(tests, robot.model)
     model = steps.robot
@@ -82,6 +86,10 @@ def calibrate(
     ft.save_calibration(found, model, out)
     show(*calibration_parts(found, model))
     tell(f"written to {out}")
+    if store is not None:
+        from failuretwin.app.records import keep_calibration
+
+        tell(keep_calibration(store, memory.name_of(model), found, robot.model))
     if found.beats_uncalibrated is not False:
         tell(f"use it with `failuretwin diagnose --calibration {out}`")
 

@@ -193,17 +193,21 @@ def save_calibration(calibration: Calibration, robot: Robot, path: str | Path) -
     Raises:
         OutputError: If it cannot be written; the old file is as before.
     """
+    write_text(calibration_text(calibration, robot), Path(path))
+
+
+def calibration_text(calibration: Calibration, robot: Robot) -> str:
+    """Return a calibration as TOML, the text of its file."""
     import tomli_w
 
     record = _plain(calibration)
     table = record.pop("imperfections")
     origin = dict(zip(ORIGIN, (robot.name, __version__), strict=True))
-    text = (
+    return (
         "# What a healthy robot does that its twin does not, learned from its logs: [calibration]\n"
         "# says how. Angles in rad in the sense of the logs, times in s.\n"
         f"{tomli_w.dumps({**table, CALIBRATION_TABLE: {**origin, **record}})}"
     )
-    write_text(text, Path(path))
 
 
 def check_calibration_file(path: Path, robot: Robot, name: str) -> None:

@@ -1,0 +1,173 @@
+"""`failuretwin store`, `history`, `found`, `repaired` and `query`: what robots went through."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+import failuretwin as ft
+from failuretwin.app.commands import options as opt
+from failuretwin.app.terminal import show, tell
+from failuretwin.core.errors import InputError, counted
+from failuretwin.data_knowledge.records import CHECK_DAYS
+
+person_option = click.option("--by", "person", default="", metavar="NAME", help="Who says so.")
+note_option = click.option("--note", default="", metavar="TEXT", help="Anything else.")
+
+
+def _url(store: str | None) -> str:
+    if not store:
+        raise InputError(
+            f"no store is named. Name one: --store robots.db, or set {opt.STORE_VARIABLE}."
+        )
+    return store
+
+
+@click.group()
+def store() -> None:
+    """Make, upgrade, check and export the store of robots."""
+
+
+@store.command()
+@opt.store_option
+def init(store: str | None) -> None:
+    """Make a store. One that is there stays as it is."""
+    made = ft.open_store(_url(store), create=True)
+    tell(f"the store: {made.name}")
+    tell(f"use it with `failuretwin diagnose LOG --store {made.name}`")
+
+
+@store.command()
+@opt.store_option
+def upgrade(store: str | None) -> None:
+    """Bring the tables of an older store up to date. Make a copy first."""
+    from failuretwin.data_knowledge.records.database import Database
+
+    database = Database(_url(store))
+    before, after = database.upgrade()
+    said = "is up to date" if before == after else f"upgraded from revision {before}"
+    tell(f"{database.name}: {said} (revision {after})")
+
+
+@store.command()
+@opt.store_option
+def check(store: str | None) -> None:
+    """Check the database, and that every log is where it was and as it was."""
+    opened = ft.open_store(_url(store))
+    found = opened.check()
+    rows = ", ".join(f"{count} {name}" for name, count in found.rows.items() if count)
+    tell(f"{opened.name}: revision {found.revision}; {rows or 'empty'}")
+    for problem in found.problems:
+        tell(problem)
+    if found.problems:
+        raise InputError(
+            f"{opened.name}: {counted(len(found.problems), 'problem')}. Expected an undamaged "
+            "database, and logs as they were; restore them from a copy."
+        )
+    tell("no problems")
+
+
+@store.command()
+@opt.file_option("--out", "DIR", "Folder to write to, one file a table.", required=True)
+@opt.store_option
+def export(out: Path, store: str | None) -> None:
+    """Write all tables as parquet, for pandas, DuckDB and the like."""
+    rows = ft.open_store(_url(store)).export(out)
+    tell(f"written to {out}: {', '.join(f'{name} ({count})' for name, count in rows.items())}")
+
+
+@click.command()
+@click.argument("robot")
+@opt.report_option("Write the history as a page too.")
+@opt.store_option
+def history(robot: str, report: Path | None, store: str | None) -> None:
+    """Show what a robot went through: episodes, findings, repairs, calibrations, last runs."""
+    from failuretwin.app.records import history_parts, write_history_page
+
+    found = ft.open_store(_url(store)).history(robot)
+    if report is not None:
+        write_history_page(found, report)
+        tell(f"the page: {report / 'index.html'}", err=True)
+    show(*history_parts(found))
+
+
+@click.command()
+@click.argument("robot")
+@click.argument("episode", type=int)
+@opt.flag_option("--confirmed", "The motor had this fault.")
+@opt.flag_option("--wrong", "The robot was healthy.")
+@click.option(
+    "--cause",
+    default="",
+    metavar="TEXT",
+    help="The cause that was found. Alone: another cause than the diagnosed fault.",
+)
+@opt.flag_option("--withdraw", "Take the last finding back.")
+@person_option
+@note_option
+@opt.store_option
+def found(
+    robot: str,
+    episode: int,
+    confirmed: bool,
+    wrong: bool,
+    cause: str,
+    withdraw: bool,
+    person: str,
+    note: str,
+    store: str | None,
+) -> None:
+    """State what a person found about an EPISODE of a ROBOT; `history` lists the episodes."""
+    from failuretwin.app.records import episode_line
+
+    if confirmed + wrong + withdraw > 1:
+        raise click.UsageError("give one of --confirmed, --wrong and --withdraw.")
+    if not (confirmed or wrong or withdraw or cause):
+        raise click.UsageError("give one of --confirmed, --wrong, --cause TEXT and --withdraw.")
+    opened = ft.open_store(_url(store))
+    if withdraw:
+        opt.refuse_unused("a finding is taken back", "cause")
+        stated = opened.withdraw(robot, episode, person=person, note=note)
+    else:
+        verdict = "confirmed" if confirmed else "wrong" if wrong else "other cause"
+        stated = opened.found(robot, episode, verdict, cause=cause, person=person, note=note)
+    standing = stated.finding
+    tell(f"{robot}, {episode_line(stated)}")
+    tell(f"finding: {standing.verdict if standing else 'none'}")
+
+
+@click.command()
+@click.argument("robot")
+@click.argument("motor")
+@click.option("--part", default="", metavar="TEXT", help="The part that was replaced.")
+@person_option
+@note_option
+@opt.store_option
+def repaired(robot: str, motor: str, part: str, person: str, note: str, store: str | None) -> None:
+    """State that a MOTOR of a ROBOT was repaired. The next healthy run clears its episode."""
+    ft.open_store(_url(store)).repaired(robot, motor, part=part, person=person, note=note)
+    tell(f"{robot}, {motor}: {f'{part} replaced' if part else 'repaired'}")
+
+
+@click.command()
+@click.argument("name", required=False)
+@click.option(
+    "--days",
+    type=click.FloatRange(min=0.0),
+    default=CHECK_DAYS,
+    metavar="DAYS",
+    help="Time without a run after which a robot is due.",
+)
+@opt.store_option
+def query(name: str | None, days: float, store: str | None) -> None:
+    """Answer a ready question about all robots. Without a NAME: list the questions."""
+    from failuretwin.app.records import query_table
+    from failuretwin.data_knowledge.records.queries import QUESTIONS
+
+    if name is None:
+        for question, asked in QUESTIONS.items():
+            tell(f"{question:24}{asked.title}")
+        return
+    answer = ft.open_store(_url(store)).query(name, days)
+    show(query_table(answer) if answer.rows else f"{answer.title} None.")

@@ -1,0 +1,328 @@
+"""The history of one robot, as values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import sqlalchemy as sa
+
+from failuretwin.core.errors import counted
+from failuretwin.data_knowledge.records.episodes import CLEARED, CONFIRMED, RAISED
+from failuretwin.data_knowledge.records.schema import (
+    calibrations,
+    diagnoses,
+    episode_events,
+    episodes,
+    findings,
+    profiles,
+    repairs,
+    runs,
+)
+
+RECENT = 20
+"""Number of diagnoses that a history lists; the others are counted."""
+WRONG, OTHER_CAUSE = "wrong", "other cause"
+"""Verdicts of a finding, in addition to `CONFIRMED`."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a person found about an episode.
+
+    Attributes:
+        number: Its number in the store.
+        verdict: ``confirmed``, ``wrong`` or ``other cause``.
+        cause: The cause; empty if not stated.
+        person: Who found it; empty if not stated.
+        note: Anything else.
+        at: When it was stated (UTC).
+        withdrawn_when: When it was withdrawn (UTC); None: it stands.
+    """
+
+    number: int
+    verdict: str
+    cause: str
+    person: str
+    note: str
+    at: datetime
+    withdrawn_when: datetime | None = None
+
+
+@dataclass(frozen=True)
+class FaultEpisode:
+    """A fault of one motor from its first diagnosis to the healthy one that clears it.
+
+    Attributes:
+        number: Its number at this robot, from 1.
+        motor: The motor.
+        mode: The fault mode.
+        since: Time of the first diagnosis (UTC).
+        until: Time of the diagnosis that cleared it (UTC); None: open.
+        raised: Whether the mode became certain.
+        findings: What people found, the oldest first, withdrawn ones included.
+    """
+
+    number: int
+    motor: str
+    mode: str
+    since: datetime
+    until: datetime | None
+    raised: bool
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def finding(self) -> Finding | None:
+        """The last finding that stands; None: none does."""
+        standing = [one for one in self.findings if one.withdrawn_when is None]
+        return standing[-1] if standing else None
+
+    @property
+    def state(self) -> str:
+        """``suspected``, ``raised``, ``confirmed`` or ``cleared``."""
+        if self.until is not None:
+            return CLEARED
+        if self.finding is not None and self.finding.verdict == CONFIRMED:
+            return CONFIRMED
+        return RAISED if self.raised else "suspected"
+
+
+@dataclass(frozen=True)
+class StoredCalibration:
+    """A calibration and the time in which it holds.
+
+    Attributes:
+        number: Its number in the store.
+        name: Its name.
+        protocol: Real data it rests on: P0c or P1.
+        document: The calibration file (TOML).
+        valid_from: Start of its validity (UTC).
+        valid_to: End of its validity (UTC); None: in force.
+    """
+
+    number: int
+    name: str
+    protocol: str
+    document: str
+    valid_from: datetime
+    valid_to: datetime | None
+
+
+@dataclass(frozen=True)
+class Repair:
+    """A repair of a motor: when (UTC), the replaced part, who did it, and a note."""
+
+    at: datetime
+    motor: str
+    part: str
+    person: str
+    note: str
+
+
+@dataclass(frozen=True)
+class StoredDiagnosis:
+    """A diagnosis in a history: time of its run (UTC), run, state and verdict."""
+
+    at: datetime
+    run: str
+    state: str
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A line of a timeline: when (UTC), the kind of event, and a sentence."""
+
+    at: datetime
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True)
+class History:
+    """What the store knows of a robot.
+
+    Attributes:
+        robot: Its name.
+        kind: Name of its profile; empty if it has none.
+        counts: Number of diagnoses by state.
+        first: Time of the first diagnosed run (UTC); None: none.
+        last: Time of the last one (UTC).
+        recent: The last `RECENT` diagnoses, the oldest first.
+        episodes: Fault episodes, the oldest first.
+        calibrations: Calibrations, the oldest first.
+        repairs: Repairs, the oldest first.
+    """
+
+    robot: str
+    kind: str
+    counts: Mapping[str, int]
+    first: datetime | None
+    last: datetime | None
+    recent: tuple[StoredDiagnosis, ...]
+    episodes: tuple[FaultEpisode, ...]
+    calibrations: tuple[StoredCalibration, ...]
+    repairs: tuple[Repair, ...]
+
+    @property
+    def open_episodes(self) -> list[FaultEpisode]:
+        """Episodes that are not cleared and were not found wrong."""
+        refuted = (WRONG, OTHER_CAUSE)
+        return [
+            one
+            for one in self.episodes
+            if one.until is None and not (one.finding and one.finding.verdict in refuted)
+        ]
+
+    @property
+    def health(self) -> str:
+        """One sentence on the state of the robot."""
+        if self.open_episodes:
+            return "; ".join(
+                f"{one.motor}: {one.mode}, {one.state}, since {_day(one.since)}"
+                for one in self.open_episodes
+            )
+        if not self.recent:
+            return "no run has been diagnosed"
+        return f"no open fault; last run ({_day(self.recent[-1].at)}): {self.recent[-1].state}"
+
+    @property
+    def timeline(self) -> list[Moment]:
+        """Everything with its time, the oldest first; of the diagnoses only `recent`."""
+        moments = [Moment(one.at, "run", f"{one.run}: {one.verdict}") for one in self.recent]
+        for episode in self.episodes:
+            moments += _moments_of(episode)
+        for calibration in self.calibrations:
+            text = f"{calibration.name} ({calibration.protocol}) in force"
+            moments.append(Moment(calibration.valid_from, "calibration", text))
+        moments += [Moment(one.at, "repair", _repair_text(one)) for one in self.repairs]
+        return sorted(moments, key=lambda moment: moment.at)
+
+
+def _day(time: datetime) -> str:
+    return f"{time:%Y-%m-%d}"
+
+
+def _moments_of(episode: FaultEpisode) -> list[Moment]:
+    name = f"episode {episode.number}"
+    start = f"{name} begins: {episode.motor} {episode.mode}"
+    moments = [Moment(episode.since, "episode", start)]
+    if episode.until is not None:
+        moments.append(Moment(episode.until, "episode", f"{name} cleared"))
+    for one in episode.findings:
+        said = ", ".join(filter(None, (one.verdict, one.cause, one.note)))
+        by = f" ({one.person})" if one.person else ""
+        moments.append(Moment(one.at, "finding", f"{name}: {said}{by}"))
+        if one.withdrawn_when is not None:
+            text = f"{name}: finding {one.verdict!r} withdrawn"
+            moments.append(Moment(one.withdrawn_when, "finding", text))
+    return moments
+
+
+def _repair_text(repair: Repair) -> str:
+    part = f"{repair.part} replaced" if repair.part else "repaired"
+    note = f", {repair.note}" if repair.note else ""
+    by = f" ({repair.person})" if repair.person else ""
+    return f"{repair.motor}: {part}{note}{by}"
+
+
+# Reading from the store.
+
+
+def read_history(connection: sa.Connection, row: int, robot: str) -> History:
+    """Return the history of a robot, given its row and name."""
+    of = diagnoses.c.robot_id == row
+    table = sa.select(diagnoses.c.state, sa.func.count()).where(of).group_by(diagnoses.c.state)
+    first = connection.scalar(sa.select(sa.func.min(diagnoses.c.at)).where(of))
+    last = connection.scalar(sa.select(sa.func.max(diagnoses.c.at)).where(of))
+    return History(
+        robot,
+        _kind(connection, row),
+        {str(state): int(count) for state, count in connection.execute(table)},
+        first,
+        last,
+        _recent(connection, row),
+        read_episodes(connection, row),
+        read_calibrations(connection, row),
+        _repairs(connection, row),
+    )
+
+
+def _kind(connection: sa.Connection, row: int) -> str:
+    newest = sa.select(profiles.c.name).where(profiles.c.robot_id == row)
+    return connection.scalar(newest.order_by(profiles.c.id.desc()).limit(1)) or ""
+
+
+def _recent(connection: sa.Connection, row: int) -> tuple[StoredDiagnosis, ...]:
+    query = (
+        sa.select(diagnoses.c.at, runs.c.name, diagnoses.c.state, diagnoses.c.verdict)
+        .join(runs, runs.c.id == diagnoses.c.run_id)
+        .where(diagnoses.c.robot_id == row)
+        .order_by(diagnoses.c.at.desc(), diagnoses.c.id.desc())
+        .limit(RECENT)
+    )
+    return tuple(StoredDiagnosis(*found) for found in connection.execute(query))[::-1]
+
+
+def read_episodes(connection: sa.Connection, row: int) -> tuple[FaultEpisode, ...]:
+    """Return the fault episodes of a robot, the oldest first."""
+    of = episodes.c.robot_id == row
+    certain = _ids(
+        connection,
+        sa.select(episode_events.c.episode_id)
+        .join(episodes)
+        .where(of, episode_events.c.state == RAISED),
+    )
+    found = _findings(connection, sa.select(findings).join(episodes).where(of))
+    rows = connection.execute(sa.select(episodes).where(of).order_by(episodes.c.number))
+    return tuple(
+        FaultEpisode(
+            *(one.number, one.motor, one.mode, one.since, one.until),
+            one.id in certain,
+            tuple(found.get(one.id, ())),
+        )
+        for one in rows
+    )
+
+
+def _ids(connection: sa.Connection, query: sa.Select[Any]) -> set[int]:
+    return set(connection.scalars(query))
+
+
+def _findings(connection: sa.Connection, query: sa.Select[Any]) -> dict[int, list[Finding]]:
+    """Return the findings of each episode, with those that were withdrawn marked."""
+    rows = connection.execute(query.order_by(findings.c.id)).all()
+    withdrawn = {one.withdraws: one.at for one in rows if one.withdraws is not None}
+    found: dict[int, list[Finding]] = {}
+    for one in rows:
+        if one.withdraws is None:
+            stated = (one.id, one.verdict, one.cause, one.person, one.note, one.at)
+            finding = Finding(*stated, withdrawn.get(one.id))
+            found.setdefault(one.episode_id, []).append(finding)
+    return found
+
+
+def read_calibrations(connection: sa.Connection, row: int) -> tuple[StoredCalibration, ...]:
+    """Return the calibrations of a robot, the oldest first."""
+    query = sa.select(calibrations).where(calibrations.c.robot_id == row)
+    ordered = query.order_by(calibrations.c.valid_from, calibrations.c.id)
+    return tuple(_stored(one) for one in connection.execute(ordered))
+
+
+def _stored(one: Any) -> StoredCalibration:
+    validity = (one.valid_from, one.valid_to)
+    return StoredCalibration(one.id, one.name, one.protocol, one.document, *validity)
+
+
+def _repairs(connection: sa.Connection, row: int) -> tuple[Repair, ...]:
+    query = sa.select(repairs).where(repairs.c.robot_id == row).order_by(repairs.c.at, repairs.c.id)
+    rows = connection.execute(query)
+    return tuple(Repair(one.at, one.motor, one.part, one.person, one.note) for one in rows)
+
+
+def state_counts(counts: Mapping[str, int]) -> str:
+    """Return counts by state in words: "2 runs faulty, 1 run healthy"."""
+    ordered: Iterable[tuple[str, int]] = sorted(counts.items(), key=lambda item: -item[1])
+    return ", ".join(f"{counted(count, 'run')} {state}" for state, count in ordered)

@@ -1,0 +1,56 @@
+"""Migrations of the store's schema by alembic, which is loaded only to change tables.
+
+A new revision is a module in `versions` and the name in `HEAD`.
+"""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from typing import TYPE_CHECKING
+
+import sqlalchemy as sa
+
+from failuretwin.core.errors import needs_extra
+
+if TYPE_CHECKING:
+    from alembic.config import Config
+
+HEAD = "2"
+"""Revision that this version of the package reads and writes."""
+REVISION_TABLE = "alembic_version"
+"""Table in which alembic keeps the revision."""
+
+
+def _config() -> Config:
+    with needs_extra("tables of the store need alembic", "store"):
+        from alembic.config import Config
+    config = Config()
+    config.set_main_option("script_location", str(files(__package__)).replace("%", "%%"))
+    config.set_main_option("path_separator", "os")
+    return config
+
+
+def revisions() -> list[str]:
+    """Return the known revisions, the oldest first."""
+    config = _config()
+    from alembic.script import ScriptDirectory
+
+    script = ScriptDirectory.from_config(config)
+    return [one.revision for one in script.walk_revisions()][::-1]
+
+
+def revision_of(connection: sa.Connection) -> str | None:
+    """Return the revision of a database; None where no store has been made."""
+    if not sa.inspect(connection).has_table(REVISION_TABLE):
+        return None
+    revision = sa.column("version_num", sa.String)
+    return connection.scalar(sa.select(revision).select_from(sa.table(REVISION_TABLE)))
+
+
+def upgrade(connection: sa.Connection, revision: str = HEAD) -> None:
+    """Bring a database to a revision, within the transaction of the connection."""
+    config = _config()
+    from alembic import command
+
+    config.attributes["connection"] = connection
+    command.upgrade(config, revision)
