@@ -23,6 +23,11 @@ TRAINS = 'if __name__ == "__main__":  # other processes'
 """Begins a block that takes ten minutes; `ft.train` has tests of its own."""
 GIVEN = {"time": 0.0, "commands": np.zeros((1000, 4)), "points": np.full((1000, 3), 0.1)}
 """What a page says the reader has."""
+BEFORE = {
+    "metrics.md": ("diagnose", "runs.nc", "--json", "results.jsonl"),
+    "store.md": ("store", "init", "--store", "robots.db"),
+}
+"""The command that the reader has run before the code of a page."""
 CALIBRATIONS = {
     "my_robot.toml": "armpi_fpv.toml",
     "robot_1.toml": "armpi_fpv.toml",
@@ -58,8 +63,8 @@ def test_python_of_a_page_runs(page, home, failuretwin, capsys, monkeypatch):
     namespace = {"__name__": __name__, **GIVEN}
     with executed.in_a_folder_of_its_own():
         shutil.copytree(home, Path.cwd(), dirs_exist_ok=True)
-        if page.name == "metrics.md":
-            failuretwin("diagnose", "runs.nc", "--json", "results.jsonl", folder=Path.cwd())
+        if page.name in BEFORE:
+            failuretwin(*BEFORE[page.name], folder=Path.cwd())
         for code in blocks(page, "python"):
             if TRAINS not in code:
                 short = code.replace("runs_per_class=100_000", "runs_per_class=10")
