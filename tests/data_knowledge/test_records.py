@@ -134,12 +134,36 @@ def test_an_episode_is_suspected_while_only_the_motor_is_certain(store, place):
     assert events == [("suspected",), ("raised",)]
 
 
+@pytest.mark.parametrize("verdict", ["wrong", "other cause"])
+def test_a_finding_hides_no_later_fault(store, verdict):
+    """The next sure diagnosis begins an episode of its own, until a person judges that one too."""
+    stuck = diagnosis("run", "motor_1:stuck")
+    store.remember([stuck], "arm_7", log=a_log(0))
+    store.found("arm_7", 1, verdict, cause="a loose cable")
+    assert store.history("arm_7").open_episodes == []
+    store.remember([stuck], "arm_7", log=a_log(1))
+    store.remember([stuck], "arm_7", log=a_log(2))
+    found = store.history("arm_7")
+    assert [(one.number, one.state) for one in found.episodes] == [(1, "cleared"), (2, "raised")]
+    assert [one.number for one in found.open_episodes] == [2]
+    assert found.episodes[0].until == found.episodes[1].since == DAY + timedelta(days=1)
+
+
+def test_a_finding_that_is_withdrawn_leaves_the_episode_as_it_was(store):
+    stuck = diagnosis("run", "motor_1:stuck")
+    store.remember([stuck], "arm_7", log=a_log(0))
+    store.found("arm_7", 1, "wrong")
+    store.withdraw("arm_7", 1)
+    store.remember([stuck], "arm_7", log=a_log(1))
+    assert [one.state for one in store.history("arm_7").episodes] == ["raised"]
+
+
 def test_an_older_log_is_kept_and_changes_no_episode(store):
     store.remember([diagnosis("run", "motor_1:stuck")], "arm_7", log=a_log(5))
     store.remember([diagnosis("run", "healthy")], "arm_7", log=a_log(1))
     found = store.history("arm_7")
     assert [one.state for one in found.episodes] == ["raised"]
-    assert (found.first, found.last) == (DAY + timedelta(days=1), DAY + timedelta(days=5))
+    assert [one.at for one in found.recent] == [DAY + timedelta(days=k) for k in (1, 5)]
     assert [one.state for one in found.recent] == ["healthy", "faulty"]
 
 

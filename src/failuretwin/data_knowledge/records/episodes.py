@@ -7,7 +7,8 @@
 3. Later diagnoses that name the same motor and mode continue it; one that is sure of the mode
    raises a suspected one.
 4. A healthy diagnosis clears all open episodes. A diagnosis of another mode of the same motor
-   clears its episode and begins another. All others change nothing.
+   clears its episode and begins another; so does any fault of a motor whose episode a person has
+   found wrong, so that a finding hides no later fault. All others change nothing.
 
 An open episode that a person has confirmed is `confirmed`; see `history.FaultEpisode`.
 """
@@ -79,6 +80,7 @@ class Course:
     fault: NamedFault
     since: datetime
     row: int | None = None
+    refuted: bool = False
     until: datetime | None = None
     events: list[tuple[str, datetime, int]] = field(default_factory=list)
 
@@ -111,7 +113,7 @@ class EpisodeTracker:
 
     def _name(self, fault: NamedFault, at: datetime, number: int) -> None:
         course = self._open.get(fault.motor)
-        if course is not None and course.fault.mode != fault.mode:
+        if course is not None and (course.refuted or course.fault.mode != fault.mode):
             self._clear(fault.motor, at, number)
             course = None
         if course is None:

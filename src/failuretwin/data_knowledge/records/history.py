@@ -10,7 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from failuretwin.core.errors import counted
-from failuretwin.data_knowledge.records.episodes import CLEARED, CONFIRMED, RAISED
+from failuretwin.data_knowledge.records.episodes import CLEARED, CONFIRMED, RAISED, SUSPECTED
 from failuretwin.data_knowledge.records.schema import (
     calibrations,
     diagnoses,
@@ -56,6 +56,7 @@ class FaultEpisode:
     """A fault of one motor from its first diagnosis to the healthy one that clears it.
 
     Attributes:
+        row: Its row in the store.
         number: Its number at this robot, from 1.
         motor: The motor.
         mode: The fault mode.
@@ -65,6 +66,7 @@ class FaultEpisode:
         findings: What people found, the oldest first, withdrawn ones included.
     """
 
+    row: int
     number: int
     motor: str
     mode: str
@@ -80,13 +82,18 @@ class FaultEpisode:
         return standing[-1] if standing else None
 
     @property
+    def refuted(self) -> bool:
+        """Whether a person found it wrong, or another cause."""
+        return self.finding is not None and self.finding.verdict in (WRONG, OTHER_CAUSE)
+
+    @property
     def state(self) -> str:
         """``suspected``, ``raised``, ``confirmed`` or ``cleared``."""
         if self.until is not None:
             return CLEARED
         if self.finding is not None and self.finding.verdict == CONFIRMED:
             return CONFIRMED
-        return RAISED if self.raised else "suspected"
+        return RAISED if self.raised else SUSPECTED
 
 
 @dataclass(frozen=True)
@@ -148,8 +155,6 @@ class History:
         robot: Its name.
         kind: Name of its profile; empty if it has none.
         counts: Number of diagnoses by state.
-        first: Time of the first diagnosed run (UTC); None: none.
-        last: Time of the last one (UTC).
         recent: The last `RECENT` diagnoses, the oldest first.
         episodes: Fault episodes, the oldest first.
         calibrations: Calibrations, the oldest first.
@@ -159,8 +164,6 @@ class History:
     robot: str
     kind: str
     counts: Mapping[str, int]
-    first: datetime | None
-    last: datetime | None
     recent: tuple[StoredDiagnosis, ...]
     episodes: tuple[FaultEpisode, ...]
     calibrations: tuple[StoredCalibration, ...]
@@ -169,12 +172,7 @@ class History:
     @property
     def open_episodes(self) -> list[FaultEpisode]:
         """Episodes that are not cleared and were not found wrong."""
-        refuted = (WRONG, OTHER_CAUSE)
-        return [
-            one
-            for one in self.episodes
-            if one.until is None and not (one.finding and one.finding.verdict in refuted)
-        ]
+        return [one for one in self.episodes if one.until is None and not one.refuted]
 
     @property
     def health(self) -> str:
@@ -235,14 +233,10 @@ def read_history(connection: sa.Connection, row: int, robot: str) -> History:
     """Return the history of a robot, given its row and name."""
     of = diagnoses.c.robot_id == row
     table = sa.select(diagnoses.c.state, sa.func.count()).where(of).group_by(diagnoses.c.state)
-    first = connection.scalar(sa.select(sa.func.min(diagnoses.c.at)).where(of))
-    last = connection.scalar(sa.select(sa.func.max(diagnoses.c.at)).where(of))
     return History(
         robot,
         _kind(connection, row),
         {str(state): int(count) for state, count in connection.execute(table)},
-        first,
-        last,
         _recent(connection, row),
         read_episodes(connection, row),
         read_calibrations(connection, row),
@@ -269,26 +263,18 @@ def _recent(connection: sa.Connection, row: int) -> tuple[StoredDiagnosis, ...]:
 def read_episodes(connection: sa.Connection, row: int) -> tuple[FaultEpisode, ...]:
     """Return the fault episodes of a robot, the oldest first."""
     of = episodes.c.robot_id == row
-    certain = _ids(
-        connection,
-        sa.select(episode_events.c.episode_id)
-        .join(episodes)
-        .where(of, episode_events.c.state == RAISED),
-    )
+    raised = sa.select(episode_events.c.episode_id).join(episodes)
+    certain = set(connection.scalars(raised.where(of, episode_events.c.state == RAISED)))
     found = _findings(connection, sa.select(findings).join(episodes).where(of))
     rows = connection.execute(sa.select(episodes).where(of).order_by(episodes.c.number))
     return tuple(
         FaultEpisode(
-            *(one.number, one.motor, one.mode, one.since, one.until),
+            *(one.id, one.number, one.motor, one.mode, one.since, one.until),
             one.id in certain,
             tuple(found.get(one.id, ())),
         )
         for one in rows
     )
-
-
-def _ids(connection: sa.Connection, query: sa.Select[Any]) -> set[int]:
-    return set(connection.scalars(query))
 
 
 def _findings(connection: sa.Connection, query: sa.Select[Any]) -> dict[int, list[Finding]]:

@@ -41,7 +41,6 @@ from failuretwin.data_knowledge.records.log_files import LogFile, log_file, utc
 from failuretwin.data_knowledge.records.queries import QueryAnswer, ask
 from failuretwin.data_knowledge.records.schema import (
     calibrations,
-    episodes,
     findings,
     logs,
     metadata,
@@ -215,16 +214,14 @@ class Store:
         with self._database.writing() as connection:
             row = writing.find_locked(connection, robot)
             episode = _episode(connection, row, robot, number)
-            standing = episode.finding
+            standing = episode.finding if withdraw else None
             if withdraw and standing is None:
                 raise InputError(
                     f"episode {number} of {robot!r} has no finding to withdraw. Expected one of "
                     "`failuretwin found`."
                 )
-            extra = {"withdraws": standing.number if withdraw and standing else None}
-            extra |= {"episode_id": _episode_row(connection, row, number)}
-            now = {"at": datetime.now(UTC)}
-            writing.add_rows(connection, findings, [{**stated, **extra, **now}])
+            of = {"episode_id": episode.row, "withdraws": standing and standing.number}
+            writing.add_rows(connection, findings, [{**stated, **of, "at": datetime.now(UTC)}])
             return _episode(connection, row, robot, number)
 
     def repaired(
@@ -447,11 +444,7 @@ def _add_diagnoses(
 def _episodes_of(
     connection: sa.Connection, robot: int, changed: Sequence[int]
 ) -> tuple[FaultEpisode, ...]:
-    if not changed:
-        return ()
-    query = sa.select(episodes.c.id, episodes.c.number).where(episodes.c.robot_id == robot)
-    numbers = {number for row, number in connection.execute(query) if row in set(changed)}
-    return tuple(one for one in read_episodes(connection, robot) if one.number in numbers)
+    return tuple(one for one in read_episodes(connection, robot) if one.row in changed)
 
 
 # Parts of the other calls.
@@ -464,11 +457,6 @@ def _episode(connection: sa.Connection, row: int, robot: str, number: int) -> Fa
         valid = ", ".join(str(one.number) for one in all_of_it) or "none so far"
         raise InputError(f"robot {robot!r} has no episode {number}. Its episodes: {valid}.")
     return found
-
-
-def _episode_row(connection: sa.Connection, robot: int, number: int) -> int:
-    of = (episodes.c.robot_id == robot, episodes.c.number == number)
-    return connection.execute(sa.select(episodes.c.id).where(*of)).scalar_one()
 
 
 def _in_force(connection: sa.Connection, robot: int) -> StoredCalibration | None:

@@ -22,6 +22,7 @@ from failuretwin.data_knowledge.records.episodes import (
     EpisodeTracker,
     NamedFault,
 )
+from failuretwin.data_knowledge.records.history import read_episodes
 from failuretwin.data_knowledge.records.log_files import LogFile
 from failuretwin.data_knowledge.records.schema import (
     diagnoses,
@@ -215,19 +216,15 @@ def latest_run(connection: sa.Connection, robot: int) -> datetime | None:
 
 def tracker_of(connection: sa.Connection, robot: int) -> EpisodeTracker:
     """Return the tracker of a robot with its open episodes."""
-    certain = sa.exists().where(
-        episode_events.c.episode_id == episodes.c.id, episode_events.c.state == RAISED
-    )
-    query = sa.select(episodes, certain.label("certain")).where(
-        episodes.c.robot_id == robot, episodes.c.until.is_(None)
-    )
     return EpisodeTracker(
         Course(
-            NamedFault(one.motor, one.mode, RAISED if one.certain else SUSPECTED),
+            NamedFault(one.motor, one.mode, RAISED if one.raised else SUSPECTED),
             one.since,
-            one.id,
+            one.row,
+            one.refuted,
         )
-        for one in connection.execute(query)
+        for one in read_episodes(connection, robot)
+        if one.until is None
     )
 
 

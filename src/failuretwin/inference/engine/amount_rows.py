@@ -92,15 +92,16 @@ class _Motor:
         Returns:
             Amounts (run, row) and outcomes (run, row, moment).
         """
-        moments, says = self.scene.moments, list[FloatArray]()
+        moments = self.scene.moments
         nodes, between = _chebyshev(grid)
         nodes = np.repeat(nodes[:, None], 1 if alike else len(self.first), axis=1)
         point = np.moveaxis(moments.point, -1, 0)[:, :, None, :, None]
-        precision = log_determinant = np.zeros(0)
-        for a in range(min(1 + len(self.variance), moments.base.shape[2])):
-            expected, jacobian, angle = self._expected(nodes, np.full((1, 1, 1), a))
-            if a == 0:
-                precision, log_determinant = self._precision(between, jacobian, angle)
+        count = min(1 + len(self.variance), moments.base.shape[2])  # one loss at most
+        seen = [self._expected(nodes, ARRIVED + a) for a in range(count)]
+        _, jacobian, angle = seen[0]
+        precision, log_determinant = self._precision(between, jacobian, angle)
+        says = []
+        for a, (expected, _, _) in enumerate(seen):
             error = point - np.moveaxis(expected, -1, 0) @ between.T
             square = symmetric.dot(error, symmetric.times(precision, error))
             weight = moments.log_weight[:, None, :, None, a]
@@ -207,7 +208,7 @@ class _Motor:
         scene, moments, motor = self.scene, self.scene.moments, self.motor
         base = np.repeat(moments.base[:, None], x.shape[1], axis=1)
         for a in range(base.shape[3]):
-            angle = self.angle(x[..., None], np.full((1, 1, 1), a))[..., 0]  # (run, row, moment)
+            angle = self.angle(x[..., None], ARRIVED + a)[..., 0]  # (run, row, moment)
             if self.held:
                 base[..., a, motor] = angle
             else:  # off where each outcome of the commands leads
