@@ -11,6 +11,7 @@ import click
 
 import failuretwin as ft
 from failuretwin.app.commands import options as opt
+from failuretwin.app.commands.store import StoreOptions, recorded_option, store_options
 from failuretwin.app.terminal import show, tell
 from failuretwin.core.errors import InputError
 
@@ -95,8 +96,8 @@ LEARNING = ("out", "independent")
     "by a zero that has moved. Only those joints of `observation.state` and its statistics "
     "change; `action` never does, nor does a stuck motor.",
 )
-@opt.store_options
-@opt.recorded_option
+@store_options
+@recorded_option
 @opt.reading_options
 @opt.plugin_option
 @opt.calibrated_robot_options()
@@ -116,7 +117,7 @@ def diagnose(
     report: Path | None,
     correct: Path | None,
     recorded: datetime | None,
-    memory: opt.StoreOptions,
+    memory: StoreOptions,
     reading: opt.LogOptions,
     robot: opt.RobotOptions,
 ) -> None:

@@ -10,6 +10,7 @@ import click
 
 import failuretwin as ft
 from failuretwin.app.commands import options as opt
+from failuretwin.app.commands.store import StoreOptions, store_options
 from failuretwin.app.terminal import progress_bar, show, tell
 from failuretwin.core.errors import InputError
 
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     "Each LOG is a calibration of another robot of the kind: write their mean and spread, the "
     "prior of an uncalibrated robot.",
 )
-@opt.store_options
+@store_options
 @opt.reading_options
 @opt.robot_options
 def calibrate(
@@ -41,7 +42,7 @@ def calibrate(
     name: str | None,
     report: Path | None,
     pool: bool,
-    memory: opt.StoreOptions,
+    memory: StoreOptions,
     reading: opt.LogOptions,
     robot: opt.RobotOptions,
 ) -> None:

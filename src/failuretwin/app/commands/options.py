@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from datetime import datetime
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -19,7 +18,6 @@ from failuretwin.core.errors import InputError
 if TYPE_CHECKING:
     import xarray as xr
 
-    from failuretwin.app.records import DiagnosisKeeper
     from failuretwin.data_knowledge.readers.raw_sessions import As
     from failuretwin.decision.acting.safety import SafetyGate
     from failuretwin.decision.test_motions.probing import ProbeRules
@@ -208,67 +206,6 @@ published_labels_option = flag_option(
     "Take the truth of raw sessions from folder names that end in _label_K and freeze the "
     "motor of labels 1-4 from sample 49 on, as the authors of the data did.",
 )
-
-# The store.
-
-STORE_VARIABLE = "FAILURETWIN_STORE"
-"""Environment variable with the store that commands use by default."""
-store_option = click.option(
-    "--store",
-    envvar=STORE_VARIABLE,
-    show_envvar=True,
-    metavar="URL",
-    help="Store of robots: the path of an SQLite file, or postgresql://USER@HOST/DATABASE. See "
-    "docs/store.md.",
-)
-
-
-@dataclass(frozen=True)
-class StoreOptions:
-    """Values of `store_options`: where results are remembered, and as which robot's."""
-
-    store: str | None
-    robot_name: str | None
-
-    def opened(self) -> ft.Store | None:
-        """Return the store; None: nothing is remembered."""
-        if self.store:
-            return ft.open_store(self.store)
-        refuse_unused("nothing is remembered without --store", "robot_name", "recorded")
-        return None
-
-    def keeper(self, reading: LogOptions, recorded: datetime | None) -> DiagnosisKeeper | None:
-        """Return what keeps the diagnoses of some logs; None: nothing is remembered."""
-        store = self.opened()
-        if store is None:
-            return None
-        from failuretwin.app.records import DiagnosisKeeper
-
-        return DiagnosisKeeper(store, reading.logs, reading.parts, self.robot_name, recorded)
-
-    def name_of(self, robot: ft.Robot) -> str:
-        """Return the name of this robot in the store."""
-        return self.robot_name or robot.name
-
-
-store_options = gathered(
-    StoreOptions,
-    "memory",
-    store_option,
-    click.option(
-        "--robot-name",
-        metavar="NAME",
-        help="With --store: name of this very robot. Default: the name of its profile.",
-    ),
-)
-recorded_option = click.option(
-    "--recorded",
-    type=click.DateTime(["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]),
-    metavar="TIME",
-    help="With --store: when the logs were recorded (UTC), such as 2026-03-02T14:30. Default: when "
-    "each was last modified.",
-)
-
 
 topics_option = file_option(
     "--topics",

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -12,6 +15,72 @@ from failuretwin.app.terminal import show, tell
 from failuretwin.core.errors import InputError, counted
 from failuretwin.data_knowledge.records import CHECK_DAYS
 
+if TYPE_CHECKING:
+    from failuretwin.app.records import DiagnosisKeeper
+
+# Options of commands that use the store.
+
+STORE_VARIABLE = "FAILURETWIN_STORE"
+"""Environment variable with the store that commands use by default."""
+store_option = click.option(
+    "--store",
+    envvar=STORE_VARIABLE,
+    show_envvar=True,
+    metavar="URL",
+    help="Store of robots: the path of an SQLite file, or postgresql://USER@HOST/DATABASE. See "
+    "docs/store.md.",
+)
+
+
+@dataclass(frozen=True)
+class StoreOptions:
+    """Values of `store_options`: where results are remembered, and as which robot's."""
+
+    store: str | None
+    robot_name: str | None
+
+    def opened(self) -> ft.Store | None:
+        """Return the store; None: nothing is remembered."""
+        if self.store:
+            return ft.open_store(self.store)
+        opt.refuse_unused("nothing is remembered without --store", "robot_name", "recorded")
+        return None
+
+    def keeper(self, reading: opt.LogOptions, recorded: datetime | None) -> DiagnosisKeeper | None:
+        """Return what keeps the diagnoses of some logs; None: nothing is remembered."""
+        store = self.opened()
+        if store is None:
+            return None
+        from failuretwin.app.records import DiagnosisKeeper
+
+        return DiagnosisKeeper(store, reading.logs, reading.parts, self.robot_name, recorded)
+
+    def name_of(self, robot: ft.Robot) -> str:
+        """Return the name of this robot in the store."""
+        return self.robot_name or robot.name
+
+
+store_options = opt.gathered(
+    StoreOptions,
+    "memory",
+    store_option,
+    click.option(
+        "--robot-name",
+        metavar="NAME",
+        help="With --store: name of this very robot. Default: the name of its profile.",
+    ),
+)
+recorded_option = click.option(
+    "--recorded",
+    type=click.DateTime(["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]),
+    metavar="TIME",
+    help="With --store: when the logs were recorded (UTC), such as 2026-03-02T14:30. Default: when "
+    "each was last modified.",
+)
+
+
+# Commands.
+
 person_option = click.option("--by", "person", default="", metavar="NAME", help="Who says so.")
 note_option = click.option("--note", default="", metavar="TEXT", help="Anything else.")
 
@@ -19,7 +88,7 @@ note_option = click.option("--note", default="", metavar="TEXT", help="Anything 
 def _url(store: str | None) -> str:
     if not store:
         raise InputError(
-            f"no store is named. Name one: --store robots.db, or set {opt.STORE_VARIABLE}."
+            f"no store is named. Name one: --store robots.db, or set {STORE_VARIABLE}."
         )
     return store
 
@@ -30,7 +99,7 @@ def store() -> None:
 
 
 @store.command()
-@opt.store_option
+@store_option
 def init(store: str | None) -> None:
     """Make a store. One that is there stays as it is."""
     made = ft.open_store(_url(store), create=True)
@@ -39,7 +108,7 @@ def init(store: str | None) -> None:
 
 
 @store.command()
-@opt.store_option
+@store_option
 def upgrade(store: str | None) -> None:
     """Bring the tables of an older store up to date. Make a copy first."""
     from failuretwin.data_knowledge.records.database import Database
@@ -51,7 +120,7 @@ def upgrade(store: str | None) -> None:
 
 
 @store.command()
-@opt.store_option
+@store_option
 def check(store: str | None) -> None:
     """Check the database, and that every log is where it was and as it was."""
     opened = ft.open_store(_url(store))
@@ -70,7 +139,7 @@ def check(store: str | None) -> None:
 
 @store.command()
 @opt.file_option("--out", "DIR", "Folder to write to, one file a table.", required=True)
-@opt.store_option
+@store_option
 def export(out: Path, store: str | None) -> None:
     """Write all tables as parquet, for pandas, DuckDB and the like."""
     rows = ft.open_store(_url(store)).export(out)
@@ -80,7 +149,7 @@ def export(out: Path, store: str | None) -> None:
 @click.command()
 @click.argument("robot")
 @opt.report_option("Write the history as a page too.")
-@opt.store_option
+@store_option
 def history(robot: str, report: Path | None, store: str | None) -> None:
     """Show what a robot went through: episodes, findings, repairs, calibrations, last runs."""
     from failuretwin.app.records import history_parts, write_history_page
@@ -106,7 +175,7 @@ def history(robot: str, report: Path | None, store: str | None) -> None:
 @opt.flag_option("--withdraw", "Take the last finding back.")
 @person_option
 @note_option
-@opt.store_option
+@store_option
 def found(
     robot: str,
     episode: int,
@@ -143,7 +212,7 @@ def found(
 @click.option("--part", default="", metavar="TEXT", help="The part that was replaced.")
 @person_option
 @note_option
-@opt.store_option
+@store_option
 def repaired(robot: str, motor: str, part: str, person: str, note: str, store: str | None) -> None:
     """State that a MOTOR of a ROBOT was repaired. The next healthy run clears its episode."""
     ft.open_store(_url(store)).repaired(robot, motor, part=part, person=person, note=note)
@@ -159,7 +228,7 @@ def repaired(robot: str, motor: str, part: str, person: str, note: str, store: s
     metavar="DAYS",
     help="Time without a run after which a robot is due.",
 )
-@opt.store_option
+@store_option
 def query(name: str | None, days: float, store: str | None) -> None:
     """Answer a ready question about all robots. Without a NAME: list the questions."""
     from failuretwin.app.records import query_table

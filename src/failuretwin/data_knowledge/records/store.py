@@ -23,7 +23,8 @@ from failuretwin import __version__
 from failuretwin.core.errors import InputError, check_name
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.runs import measured_rate
-from failuretwin.data_knowledge.records import CHECK_DAYS, migrations, schema, writing
+from failuretwin.data_knowledge.records import CHECK_DAYS, writing
+from failuretwin.data_knowledge.records.checking import StoreCheck, checked
 from failuretwin.data_knowledge.records.database import Database
 from failuretwin.data_knowledge.records.episodes import CONFIRMED
 from failuretwin.data_knowledge.records.export import export_parquet
@@ -42,8 +43,6 @@ from failuretwin.data_knowledge.records.queries import QueryAnswer, ask
 from failuretwin.data_knowledge.records.schema import (
     calibrations,
     findings,
-    logs,
-    metadata,
     repairs,
     robots,
 )
@@ -69,21 +68,6 @@ class Remembered:
     added: int
     known: int
     episodes: tuple[FaultEpisode, ...]
-
-
-@dataclass(frozen=True)
-class StoreCheck:
-    """Result of `Store.check`.
-
-    Attributes:
-        revision: Revision of the schema.
-        rows: Number of rows of each table.
-        problems: Damage of the database, and logs that are missing or changed, one a line.
-    """
-
-    revision: str
-    rows: Mapping[str, int]
-    problems: tuple[str, ...]
 
 
 class Store:
@@ -146,13 +130,13 @@ class Store:
             at = writing.keep_log(connection, row, source)
             names = [one.run for one in diagnoses]
             run_rows, new = writing.keep_runs(connection, at, names, details)
-            kept = _unknown(connection, at, diagnoses, run_rows, calibration)
+            kept = writing.new_diagnoses(connection, at, diagnoses, run_rows, calibration)
             tracker = writing.tracker_of(connection, row)
             if source.recorded >= (writing.latest_run(connection, row) or source.recorded):
                 for number, (diagnosis, run, _) in enumerate(kept):
                     if run in new:
                         tracker.follow(diagnosis, source.recorded, number)
-            rows = _add_diagnoses(connection, row, kept, source.recorded, calibration)
+            rows = writing.add_diagnoses(connection, row, kept, source.recorded, calibration)
             changed = writing.keep_episodes(connection, row, tracker.changed, rows)
             return Remembered(
                 len(kept), len(diagnoses) - len(kept), _episodes_of(connection, row, changed)
@@ -347,16 +331,7 @@ class Store:
     def check(self) -> StoreCheck:
         """Check the database, and whether each log is where it was and as it was."""
         with self._database.reading() as connection:
-            revision = migrations.revision_of(connection) or ""
-            rows = {
-                table.name: connection.scalar(sa.select(sa.func.count()).select_from(table)) or 0
-                for table in metadata.sorted_tables
-            }
-            problems = _damage(connection)
-            query = sa.select(logs.c.path, logs.c.sha256).where(logs.c.sha256.is_not(None))
-            references = connection.execute(query).all()
-        problems += filter(None, (_log_problem(*one) for one in references))
-        return StoreCheck(revision, rows, tuple(problems))
+            return checked(connection)
 
 
 def open_store(url: str | Path, *, create: bool = False) -> Store:
@@ -380,10 +355,6 @@ def open_store(url: str | Path, *, create: bool = False) -> Store:
 
 
 # Parts of `Store.remember`.
-
-Kept = list[tuple[Diagnosis, int, str]]
-"""Diagnoses with the row of their run and their digest."""
-
 
 CLOCK_ERROR = timedelta(days=1)
 """Largest lead of the clock that logs are stamped by."""
@@ -410,35 +381,6 @@ def _details(runs: xr.Dataset | None, count: int) -> list[dict[str, float] | Non
         return [None] * count
     rate = measured_rate(runs)
     return [{"duration_s": float(one), "rate_hz": rate} for one in runs["duration"].values]
-
-
-def _unknown(
-    connection: sa.Connection,
-    log: int,
-    diagnoses: Sequence[Diagnosis],
-    run_rows: Sequence[int],
-    calibration: int | None,
-) -> Kept:
-    """Return the diagnoses that are not stored yet."""
-    known = writing.stored_digests(connection, log)
-    each = [
-        (one, row, writing.digest_of(one, calibration))
-        for one, row in zip(diagnoses, run_rows, strict=True)
-    ]
-    return [one for one in each if (one[1], one[2]) not in known]
-
-
-def _add_diagnoses(
-    connection: sa.Connection, robot: int, kept: Kept, at: datetime, calibration: int | None
-) -> list[int]:
-    if not kept:
-        return []
-    session = writing.new_session(connection, robot, kept[0][0], calibration)
-    of = {"robot_id": robot, "session_id": session}
-    rows = [
-        {**writing.diagnosis_row(one, digest, at), **of, "run_id": run} for one, run, digest in kept
-    ]
-    return writing.add_rows(connection, schema.diagnoses, rows)
 
 
 def _episodes_of(
@@ -472,23 +414,3 @@ def _close(connection: sa.Connection, current: StoredCalibration, end: datetime)
         )
     row = calibrations.c.id == current.number
     connection.execute(sa.update(calibrations).where(row).values(valid_to=end))
-
-
-def _damage(connection: sa.Connection) -> list[str]:
-    """Return the damage that SQLite finds; a server checks its own pages."""
-    if connection.dialect.name != "sqlite":
-        return []
-    found = [str(row[0]) for row in connection.exec_driver_sql("PRAGMA integrity_check")]
-    broken = connection.exec_driver_sql("PRAGMA foreign_key_check").all()
-    found += [
-        f"row {row[1]} of {row[0]} refers to a row of {row[2]} that is lost" for row in broken
-    ]
-    return [line for line in found if line != "ok"]
-
-
-def _log_problem(path: str, sha256: str) -> str:
-    try:
-        now = log_file(path)
-    except InputError:
-        return f"log {path}: is missing"
-    return "" if now.sha256 == sha256 else f"log {path}: has changed since it was diagnosed"

@@ -158,8 +158,39 @@ def keep_runs(
 
 # Diagnoses.
 
+Kept = list[tuple[Diagnosis, int, str]]
+"""Diagnoses with the row of their run and their digest."""
 
-def new_session(
+
+def new_diagnoses(
+    connection: sa.Connection,
+    log: int,
+    diagnoses: Sequence[Diagnosis],
+    run_rows: Sequence[int],
+    calibration: int | None,
+) -> Kept:
+    """Return the diagnoses that are not stored yet."""
+    known = _stored_digests(connection, log)
+    each = [
+        (one, row, _digest_of(one, calibration))
+        for one, row in zip(diagnoses, run_rows, strict=True)
+    ]
+    return [one for one in each if (one[1], one[2]) not in known]
+
+
+def add_diagnoses(
+    connection: sa.Connection, robot: int, kept: Kept, at: datetime, calibration: int | None
+) -> list[int]:
+    """Store diagnoses as a session of their own, and return their rows."""
+    if not kept:
+        return []
+    session = _new_session(connection, robot, kept[0][0], calibration)
+    of = {"robot_id": robot, "session_id": session}
+    rows = [{**_diagnosis_row(one, digest, at), **of, "run_id": run} for one, run, digest in kept]
+    return add_rows(connection, diagnoses, rows)
+
+
+def _new_session(
     connection: sa.Connection, robot: int, first: Diagnosis, calibration: int | None
 ) -> int:
     """Return the row of a new session of diagnosis."""
@@ -169,19 +200,19 @@ def new_session(
     return add_rows(connection, sessions, [stated])[0]
 
 
-def digest_of(diagnosis: Diagnosis, calibration: int | None) -> str:
+def _digest_of(diagnosis: Diagnosis, calibration: int | None) -> str:
     """Return the checksum of a diagnosis and what it rests on."""
     record = [diagnosis.to_record(), diagnosis.undecided, __version__, calibration]
     return text_checksum(json.dumps(record, sort_keys=True))
 
 
-def stored_digests(connection: sa.Connection, log: int) -> set[tuple[int, str]]:
+def _stored_digests(connection: sa.Connection, log: int) -> set[tuple[int, str]]:
     """Return run and digest of all diagnoses of a log."""
     query = sa.select(diagnoses.c.run_id, diagnoses.c.digest).join(runs).where(runs.c.log_id == log)
     return {(one.run_id, one.digest) for one in connection.execute(query)}
 
 
-def diagnosis_row(diagnosis: Diagnosis, digest: str, at: datetime) -> dict[str, Any]:
+def _diagnosis_row(diagnosis: Diagnosis, digest: str, at: datetime) -> dict[str, Any]:
     """Return the columns of a diagnosis, without those that refer to other rows."""
     onset = diagnosis.onset_90 or (None, None)
     size = diagnosis.magnitude_90 or (None, None)

@@ -96,7 +96,7 @@ class _Motor:
         nodes, between = _chebyshev(grid)
         nodes = np.repeat(nodes[:, None], 1 if alike else len(self.first), axis=1)
         point = np.moveaxis(moments.point, -1, 0)[:, :, None, :, None]
-        count = min(1 + len(self.variance), moments.base.shape[2])  # one loss at most
+        count = min(1 + len(self.variance), moments.base.shape[2])  # the likeliest
         seen = [self._expected(nodes, ARRIVED + a) for a in range(count)]
         _, jacobian, angle = seen[0]
         precision, log_determinant = self._precision(between, jacobian, angle)
