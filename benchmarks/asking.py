@@ -51,12 +51,12 @@ from failuretwin.decision.test_motions.motions import Motions
 from failuretwin.decision.test_motions.outlook import Outlook, of_priors
 from failuretwin.decision.test_motions.probing import Prober, ProbeRules
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
+from failuretwin.inference.engine.registration import run_posterior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.isolability import isolability
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
-from failuretwin.inference.theta.shared_posterior import shared_posterior
 
 COUNT_RAD = float(np.deg2rad(0.24))
 AT_ONCE = 1
@@ -100,7 +100,7 @@ class Robots:
         model = self.model
         priors = Priors() if self.usual else checking(model, self.hypotheses)
         return [
-            shared_posterior(
+            run_posterior(
                 RunLikelihood(settled_evidence_of(windows[at : at + AT_ONCE]), model),
                 self.hypotheses,
                 priors,

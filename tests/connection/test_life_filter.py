@@ -29,7 +29,7 @@ from failuretwin.inference.engine.weighing import Weighing
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.theta.shared_belief import Belief, Normal
+from failuretwin.inference.together.belief import Belief, Normal
 from failuretwin.inference.theta.shared_unknowns import SharedComponent
 from failuretwin.inference.together.life_filter import CHANCE, MOST_DOUBT, WINDOW
 from failuretwin.inference.together.wear_limits import WearLimits, wear_unit

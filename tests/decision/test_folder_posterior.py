@@ -29,8 +29,8 @@ from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import log_prior
 from failuretwin.inference.theta import shared_unknowns
-from failuretwin.inference.theta.shared_belief import mixed as moments_of
-from failuretwin.inference.theta.shared_belief import positive
+from failuretwin.inference.together.belief import mixed as moments_of
+from failuretwin.inference.together.belief import positive
 from failuretwin.inference.theta.shared_unknowns import offsets_of
 from failuretwin.inference.together import folder_posterior as folder
 from failuretwin.inference.together import habits, runs_together

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from failuretwin.inference.theta.shared_belief import Normal
+from failuretwin.inference.together.belief import Normal
 from failuretwin.inference.together.mixed_runs import of_second_robot, two_robots
 
 NOISE = 0.3

@@ -27,7 +27,7 @@ from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.posterior import compute_posterior, log_prior, marginal_likelihood_of
-from failuretwin.inference.theta.shared_posterior import shared_posterior
+from failuretwin.inference.engine.registration import run_posterior
 from failuretwin.inference.theta.shared_unknowns import registered_evidence
 
 KNOWN = Imperfections("made up", "test", settling=replace(SETTLING, tail_dof=5.0))
@@ -99,7 +99,7 @@ def test_where_no_hypothesis_has_a_score_all_is_taken_as_told(twin, runs, in_dou
     diagnoser = BayesDiagnoser(twin, DOUBTED, faults)
     seen = Evidence(runs, diagnoser.healthy_model.settings).sound
     likelihood = RunLikelihood(seen.settled, diagnoser.healthy_model)
-    found = shared_posterior(likelihood, faults, Priors(), in_doubt)
+    found = run_posterior(likelihood, faults, Priors(), in_doubt)
     expected = compute_posterior(likelihood, faults, Priors())
     np.testing.assert_array_equal(found.log_posterior, expected.log_posterior)
     assert len(diagnoser.diagnose(runs)) == runs.sizes["run"]
@@ -266,7 +266,7 @@ def test_posterior_is_that_of_quadrature_over_the_scale(twin, seed):
     log_joint = log_prior(hypotheses, Priors()) + evidence
     expected = log_joint - log_sum(log_joint, axis=0)
     likelihood = RunLikelihood(seen, one.model)
-    found = shared_posterior(likelihood, hypotheses, Priors(setup=belief), in_doubt=True)
+    found = run_posterior(likelihood, hypotheses, Priors(setup=belief), in_doubt=True)
     least = -12.0  # how far below that matters to nobody
     np.testing.assert_allclose(
         np.maximum(found.log_posterior[0], least), np.maximum(expected, least), atol=0.2

@@ -34,23 +34,30 @@ from failuretwin.digital_model.calibrated_robot import (
     calibrated,
 )
 from failuretwin.digital_model.geometry import SensorFrame, roll_pitch_yaw
-from failuretwin.digital_model.nonidealities import Imperfections, LostCommand, Variation
+from failuretwin.digital_model.nonidealities import (
+    Imperfections,
+    LostCommand,
+    Readings,
+    Variation,
+)
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import poses_in_range
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.engine.theta import offsets_doubted
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
-from failuretwin.inference.posterior import log_prior
-from failuretwin.inference.set_ups.set_ups import FAR_OFF, FAULT_OF_EVERY_RUN
-from failuretwin.inference.theta.shared_unknowns import (
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.registered import (
     ORIGIN,
     REGISTRATION,
     SCALE,
     TURN,
     registered,
 )
+from failuretwin.inference.posterior import log_prior
+from failuretwin.inference.set_ups.set_ups import FAR_OFF, FAULT_OF_EVERY_RUN
 from failuretwin.inference.together.fault_course import FaultCourse
 from failuretwin.inference.together.folder_posterior import (
     Advance,
@@ -247,7 +254,7 @@ def as_calibration(
             name=learned_name(robot),
             source=source,
             protocol="P1",
-            readings=readings_of(runs, robot, None),
+            readings=_readings(found.model, runs),
             variation=_variation(found),
         ),
         parameters=tuple(parameters),
@@ -258,6 +265,12 @@ def as_calibration(
         remarks=tuple(_remarks(parameters, found, runs)),
         frame=_frame(found),
     )
+
+
+def _readings(model: HealthyModel, runs: xr.Dataset) -> Readings:
+    """Return how the sensor sampled the runs, with its noise where nobody had measured it."""
+    found = readings_of(runs, model.twin.robot, None)
+    return found if model.knows_noise else replace(found, noise_m=model.path_noise)
 
 
 def _frame(found: FolderPosterior) -> SensorFrame | None:
@@ -277,15 +290,16 @@ def _variation(found: FolderPosterior) -> Variation:
     They are those beside the frame that the calibration holds: what the two make up for is no doubt
     of where the tool comes to rest.
     """
-    if len(found.mean) == REGISTRATION:
+    if not offsets_doubted(found.model):
         return found.model.imperfections.variation or Variation()
     own = np.linalg.inv(np.linalg.inv(found.covariance)[REGISTRATION:, REGISTRATION:])
-    return stated_variation(np.sqrt(np.diag(own)), found.model.settling)
+    offsets = np.sqrt(np.diag(own))[: 3 * len(found.model.scatter)]
+    return stated_variation(offsets, found.model.settling)
 
 
 def _parameters(found: FolderPosterior, believed: Imperfections, robot: Robot) -> list[Parameter]:
     """Return every offset with its 95 % interval, and how far it lies from what such robots do."""
-    if len(found.mean) == REGISTRATION:
+    if not offsets_doubted(found.model):
         return []
     motors, told = robot.motor_names, []
     for k, name in enumerate(ODD):

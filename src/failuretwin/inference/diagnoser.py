@@ -1,6 +1,6 @@
 """Bayesian diagnosis: which hypothesis explains where the tool went, and how surely.
 
-    runs -> Evidence -> RunLikelihood -> shared_posterior -> Diagnosis of each run
+    runs -> Evidence -> RunLikelihood -> run_posterior -> Diagnosis of each run
 
 Section: docs/inference.md#posterior
 """

@@ -24,13 +24,12 @@ from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.nonidealities import with_rates
-from failuretwin.inference.engine.registration import robot_evidence
+from failuretwin.inference.engine.registration import robot_evidence, run_posterior
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
-from failuretwin.inference.theta.shared_posterior import shared_posterior
 
 LOSSES = {3.0: 0.15}
 """Factors on the rates of lost commands of the class, and the share of robots of each; assumed."""
@@ -158,7 +157,7 @@ class RobotMixture:
             some = mixture.rows_to_weigh(one, likelihood, priors)
             if len(some):
                 doubt = in_doubt and one is others[0]
-                says = shared_posterior(likelihood[some], named.hypotheses, priors, doubt)
+                says = run_posterior(likelihood[some], named.hypotheses, priors, doubt)
                 mixture = cls([*mixture.parts, RobotPosterior(one, some, says)], common)
         return mixture
 

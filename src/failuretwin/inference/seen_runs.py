@@ -17,7 +17,7 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import IntArray, as_floats
-from failuretwin.inference.engine.registration import robot_parts, sensor_in_doubt
+from failuretwin.inference.engine.registration import robot_parts, run_posterior, sensor_in_doubt
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.engine.weighing import ALLOWED_FOR, Weighing
 from failuretwin.inference.faults.priors import Priors
@@ -46,9 +46,6 @@ from failuretwin.inference.set_ups.set_ups import (
     gross_unit,
     shifted,
     turned,
-)
-from failuretwin.inference.theta.shared_posterior import (
-    shared_posterior,
 )
 
 if TYPE_CHECKING:
@@ -211,7 +208,7 @@ class SeenRuns:
         some = np.arange(len(self.settled.usable))[rows]
         likelihood = RunLikelihood(self.settled.alike(some), self.healthy, way)
         known = self.weighed_sample if np.array_equal(some, self.sampled) else ()
-        return shared_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt, known)
+        return run_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt, known)
 
     def robots(self, named: Posterior, common: Sequence[str], others: bool) -> RobotMixture:
         """Return what runs say of the robot: that of the model, or another of its kind.

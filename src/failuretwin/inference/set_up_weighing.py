@@ -27,6 +27,7 @@ from failuretwin.inference.engine.registration import (
     evidence_at_once,
 )
 from failuretwin.inference.engine.runs import has_rows
+from failuretwin.inference.engine.theta import offsets_doubted
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import highest_and_outlier
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -34,7 +35,6 @@ from failuretwin.inference.posterior import log_prior
 from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp, with_doubt
 from failuretwin.inference.set_ups.log_correction import LogCorrection
 from failuretwin.inference.set_ups.set_ups import FEWEST_TO_TURN, SetUp, mistakes, turned, zero_off
-from failuretwin.inference.theta.shared_unknowns import layout_of
 
 FEW = 8
 """Runs that set-ups are weighed by, evenly spread: five name what shows."""
@@ -91,7 +91,7 @@ class SetUpWeighing:
     def rate(self) -> float:
         """Probability that the set-up is wrong: small where healthy logs fitted the profile."""
         rates = self.priors.setup.wrong_rate
-        return rates[1] if layout_of(self.likelihood.model).offsets else rates[0]
+        return rates[1] if offsets_doubted(self.likelihood.model) else rates[0]
 
     @property
     def log_rate(self) -> float:

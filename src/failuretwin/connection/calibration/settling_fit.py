@@ -23,12 +23,12 @@ from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, largest_load
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.engine.theta import Layout, robot_components
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.set_ups.setup_prior import SetupPrior
-from failuretwin.inference.theta.shared_belief import Belief
-from failuretwin.inference.theta.shared_unknowns import REGISTRATION, SharedLayout, components
+from failuretwin.inference.together.belief import Belief
 from failuretwin.inference.together.habits import Habits
 from failuretwin.inference.together.runs_together import RunsTogether
 
@@ -134,9 +134,9 @@ class SettlingFit:
         """Where motors settle, with covariance."""
         habits, settling = _habits(self.together), self.settling
         (_,), (covariance,) = self.together.belief.moments
-        unit, own = self.together.unit, slice(REGISTRATION, None)
+        unit, own = self.together.unit, self.together.layout.offsets
         offsets = (covariance * np.outer(unit, unit))[own, own]
-        scatter = np.linalg.inv(habits.precision)
+        scatter = np.linalg.inv(habits.precision)[:-1, :-1]  # without the noise
         whole = np.zeros((len(offsets) + len(scatter),) * 2)
         whole[: len(offsets), : len(offsets)] = offsets
         whole[len(offsets) :, len(offsets) :] = scatter
@@ -218,12 +218,12 @@ def fit_settling(observations: Observations) -> SettlingFit:
     if known.sum() >= FEWEST_MOVEMENTS:
         evidence = replace(evidence, usable=known)
     likelihood = RunLikelihood(evidence, model)
-    layout = SharedLayout(len(model.scatter), offsets=True)
+    layout = Layout(len(model.scatter), geometry=False)
     priors = Priors(setup=SetupPrior.known())
-    told = components(model, priors.setup, layout)
-    unit = told[0].deviation
-    base = Belief.of(told, unit)
-    together = RunsTogether.of(likelihood, [HEALTHY], priors, base, unit)
+    believed = robot_components(model, layout, factors=False)
+    unit = np.sqrt(np.diag(believed.usual))
+    base = Belief.of(believed, unit)
+    together = RunsTogether.of(likelihood, [HEALTHY], priors, layout, base, unit)
     return fitted_to(observations, together)
 
 
@@ -252,7 +252,7 @@ def fitted_to(observations: Observations, together: RunsTogether) -> SettlingFit
 
 
 def _believed(together: RunsTogether) -> Habits:
-    given = together.given.model.imperfections
+    given = together.given.model
     return Habits.believed(given, SCATTER_PRIOR_SPREAD, DOF_PRIOR_SPREAD)
 
 

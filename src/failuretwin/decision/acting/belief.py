@@ -31,12 +31,12 @@ from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import HALF_90, BelievedArm, BelievedFault, Seen
 from failuretwin.failure_behavior.mode import Reaction, Signature
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.engine.registration import run_posterior
 from failuretwin.inference.faults.priors import MONITORING
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import LEVELS, Posterior, compute_posterior
-from failuretwin.inference.theta.shared_posterior import shared_posterior
 
 # What the latest movements say.
 
@@ -152,7 +152,7 @@ class Judge:
         log_posterior = rough.posterior.log_posterior[0]
         near = log_posterior > log_posterior.max() - RULED_OUT_NATS
         left = [h for h, keep in zip(self.hypotheses, near, strict=True) if keep or h.is_healthy]
-        return Judgement(shared_posterior(likelihood, left, MONITORING, False))
+        return Judgement(run_posterior(likelihood, left, MONITORING, False))
 
     def _is_news(self, judgement: Judgement, believed: BelievedFault | None) -> bool:
         """Return whether movements point to a fault that is not believed already."""

@@ -33,6 +33,7 @@ from failuretwin.decision.streaming.window import KEEP_S
 from failuretwin.digital_model.calibrated_robot import RobotLike
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.engine.registration import run_posterior
 from failuretwin.inference.explanation import worded
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -45,7 +46,6 @@ from failuretwin.inference.posterior import (
     log_prior,
     shows_in_transients,
 )
-from failuretwin.inference.theta.shared_posterior import shared_posterior
 
 Weigh = Callable[[RunLikelihood, Sequence[Hypothesis], Priors], Posterior]
 """Weighs hypotheses by some runs."""
@@ -473,4 +473,4 @@ def _as_recorded(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> Posterior:
     """Weigh hypotheses as of recorded runs, which takes too long for every sample."""
-    return shared_posterior(likelihood, hypotheses, priors, in_doubt=False)
+    return run_posterior(likelihood, hypotheses, priors, in_doubt=False)

@@ -45,7 +45,7 @@ from failuretwin.failure_behavior.mode import Range, Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.engine.posterior import theta_posterior
-from failuretwin.inference.engine.registration import robot_weighing, sensor_in_doubt
+from failuretwin.inference.engine.registration import robot_weighing, run_posterior, sensor_in_doubt
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.faults.priors import Priors, visible_sizes
 from failuretwin.inference.isolability import IsolabilityReport, isolability
@@ -55,7 +55,6 @@ from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.log_quality import BEYOND_USUAL, LogQuality
 from failuretwin.inference.observation.settings import ERROR_STEPS, WIDEST_ERROR
 from failuretwin.inference.posterior import Posterior, log_prior
-from failuretwin.inference.theta.shared_posterior import shared_posterior
 
 HEALTHY_TO_FAULTY = 2.0
 """Odds that an arm is healthy that nobody suspects; assumed."""
@@ -194,7 +193,7 @@ def judged(
 ) -> Posterior:
     """Return the posterior of runs, with what is doubted of the arm integrated out."""
     in_doubt = sensor_in_doubt(likelihood, hypotheses, priors)
-    return shared_posterior(likelihood, hypotheses, priors, in_doubt)
+    return run_posterior(likelihood, hypotheses, priors, in_doubt)
 
 
 MOST_RUNS = 3

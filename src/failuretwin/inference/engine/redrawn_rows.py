@@ -18,8 +18,8 @@ from failuretwin.inference.engine.outcomes import Outcomes
 from failuretwin.inference.engine.rows import Rows, Scene, sampled
 from failuretwin.inference.faults.priors import OnsetIntervals
 
-NODES = 16
-"""Nodes of the size on each side of zero, in a constant ratio."""
+RATIO = 100.0 ** (1.0 / 16.0)
+"""Ratio of one node of the size to the next, on each side of zero."""
 SMALLEST = 1e-2
 """Smallest node, as a share of the largest size, where sizes begin at nothing."""
 
@@ -29,7 +29,9 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
     moments, model = scene.moments, scene.model
     sizes = scene.priors.sizes_of(mode, model, motor)
     low, high = sizes.ends
-    edge = np.geomspace(max(low, SMALLEST * high), high, NODES + 1)
+    smallest = low if low > 0.0 else SMALLEST * high
+    count = max(1, int(np.ceil(np.log(high / smallest) / np.log(RATIO))))
+    edge = np.geomspace(smallest, high, count + 1)
     node, width = np.sqrt(edge[1:] * edge[:-1]), np.diff(edge)
     size, width = np.r_[-node[::-1], node], np.r_[width[::-1], width]
     mass = np.stack([_mass(edge, *ends) for ends in sizes.ranges])  # (range, node)

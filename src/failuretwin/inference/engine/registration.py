@@ -22,7 +22,6 @@ from failuretwin.digital_model.arm_classes import GENERIC_NAME
 from failuretwin.inference.engine.posterior import misfit_of, theta_factors
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.engine.theta import (
-    REGISTRATION,
     Components,
     Layout,
     layout_of,
@@ -32,7 +31,8 @@ from failuretwin.inference.engine.weighing import Weighing, assembled
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.posterior import Posterior, marginal_likelihoods
+from failuretwin.inference.observation.registered import REGISTRATION
+from failuretwin.inference.posterior import Posterior, compute_posterior, marginal_likelihoods
 from failuretwin.inference.set_ups.setup_prior import SetupPrior
 
 COARSE_TO_FINE = (0.026, 0.004, 0.0)
@@ -325,3 +325,36 @@ def _in_turn(chunks: Sequence[IntArray]) -> tuple[IntArray, IntArray]:
     """Return the chunk and the place in it of each run."""
     sizes = [len(one) for one in chunks]
     return np.repeat(np.arange(len(sizes)), sizes), np.concatenate([np.arange(n) for n in sizes])
+
+
+def run_posterior(
+    likelihood: RunLikelihood,
+    hypotheses: Sequence[Hypothesis],
+    priors: Priors,
+    in_doubt: bool,
+    known: Sequence[Weighing] = (),
+) -> Posterior:
+    """Weigh every hypothesis by some runs, what they share integrated out.
+
+    Where no hypothesis has rows, theta is taken as told.
+
+    Args:
+        likelihood: The runs as they were seen.
+        hypotheses: What may be the case.
+        priors: Beliefs about faults and set-ups.
+        in_doubt: Whether their sensor may be displaced.
+        known: The same runs weighed by where they rest, with a sensor that is not, where they were.
+    """
+    moving = likelihood.evidence.on_the_way
+    if moving.any() and not moving.all():
+        kinds = [np.flatnonzero(moving == kind) for kind in (False, True)]
+        parts = [run_posterior(likelihood.alike(k), hypotheses, priors, in_doubt) for k in kinds]
+        place = np.empty(len(moving), dtype=np.int64)
+        for rows in kinds:
+            place[rows] = np.arange(len(rows))
+        return assembled(likelihood, parts, moving.astype(np.int64), place)
+    if not any(has_rows(h) for h in hypotheses):
+        return compute_posterior(likelihood, hypotheses, priors)
+    if in_doubt:
+        return displaced_posterior(likelihood, hypotheses, priors)
+    return robot_posterior(likelihood, hypotheses, priors, known)

@@ -20,16 +20,17 @@ import numpy as np
 from failuretwin.core.numerics import log_of
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.theta.shared_unknowns import loads, offset_deviation
+from failuretwin.inference.observation.registered import REGISTRATION
 
-REGISTRATION = 7
-"""Length of the registration in theta: origin, turn and scale."""
 ORIGIN_M, TURN_RAD = 0.003, 0.005
 """Deviations by which the frame of a joint stands off its URDF [m, rad]: a real UR10 is 1.2 mm off,
 a 7-joint cable-driven arm 3.3 mm, at the median; assumed for all arms."""
 KNOWN = 1e-6
 """Deviation that stands for "known" in each unit of theta."""
+LEAST_SCATTER_RAD = 1e-4
+"""Scatter beside which doubts of offsets are judged, at least [rad]."""
 ODD_RATE, ODD_FACTOR = 0.1, 3.0
 """Share of robots whose offsets differ more than those of others of their kind, and how many times
 as far; assumed."""
@@ -68,6 +69,11 @@ class Layout:
     def size(self) -> int:
         """Length of theta."""
         return self.lags.stop
+
+    def place(self, theta: FloatArray) -> FloatArray:
+        """Return where theta is expanded: registration and offsets of it, frames and lags at 0."""
+        kept = np.arange(len(theta)) < self.offsets.stop
+        return np.where(kept, theta, 0.0)
 
     def own(self, motor: int) -> list[int]:
         """Return the places of one motor's bias, compliance and friction."""
@@ -127,9 +133,7 @@ class Components:
     @property
     def unknown(self) -> IntArray:
         """Places in theta that are not known in every component, (place,)."""
-        variance = np.diagonal(self.covariance, axis1=-2, axis2=-1)
-        widest = variance.reshape(-1, variance.shape[-1]).max(axis=0)
-        return np.flatnonzero((widest > 2.0 * KNOWN**2) | self._moved)
+        return np.flatnonzero((self.widest**2 > 2.0 * KNOWN**2) | self._moved)
 
     @property
     def _moved(self) -> BoolArray:
@@ -140,6 +144,12 @@ class Components:
     def usual(self) -> FloatArray:
         """V of the first normal distribution, of the first run if they have their own."""
         return self.covariance.reshape(-1, *self.covariance.shape[-2:])[0]
+
+    @property
+    def widest(self) -> FloatArray:
+        """Largest deviation of each part of theta, (theta,)."""
+        variance = np.diagonal(self.covariance, axis1=-2, axis2=-1)
+        return np.sqrt(variance.reshape(-1, variance.shape[-1]).max(axis=0))
 
     @property
     def first(self) -> Components:
@@ -295,3 +305,64 @@ def _covariance(model: HealthyModel, layout: Layout, factor: float) -> FloatArra
 def frame_deviation(robot: Robot) -> FloatArray:
     """Return the deviation of the joint frames, (6 joint,) [m, rad]."""
     return np.tile([ORIGIN_M] * 3 + [TURN_RAD] * 3, len(robot.motors))
+
+
+# What is in doubt of the offsets of a robot.
+
+SMALL_DOUBT = 0.5
+"""Doubt of an offset below this share of its motor's scatter moves no posterior by a hundredth
+[-]."""
+
+
+def loads(model: HealthyModel, pose: FloatArray) -> FloatArray:
+    """Return g, by how much each motor gives way for each unit of compliance, (..., motor) [N m].
+
+    Args:
+        model: The healthy robot.
+        pose: Angles that the motors settle near, (..., motor) [rad].
+    """
+    robot = model.twin.robot
+    return np.asarray(robot.sense * robot.loads.torque(pose * robot.sense, model.settling.payload))
+
+
+def offsets_doubted(model: HealthyModel) -> bool:
+    """Return whether a calibration leaves much of the offsets open, so that runs can teach them."""
+    motors, deviation = len(model.scatter), offset_deviation(model)
+    scatter = np.maximum(np.asarray(model.settling.scatter), LEAST_SCATTER_RAD)
+    large = deviation[:motors] > SMALL_DOUBT * scatter
+    large |= deviation[2 * motors :] > SMALL_DOUBT * scatter
+    large |= deviation[motors : 2 * motors] * typical_load(model) > SMALL_DOUBT * scatter
+    return bool(large.any())
+
+
+def typical_load(model: HealthyModel) -> FloatArray:
+    """Return the rms load torque of each motor over its range, (motor,) [N m]."""
+    load = loads_in_range(model.twin.robot, model.settling.payload)
+    return np.sqrt(np.mean(load**2, axis=0))
+
+
+def offset_deviation(model: HealthyModel) -> FloatArray:
+    """Return the standard deviation of b, c and f that is left of a robot, (3 motor,)."""
+    motors, doubt = len(model.scatter), model.imperfections.variation
+    if doubt is None:
+        return np.zeros(3 * motors)
+    compliance = np.asarray(model.settling.compliance) * np.asarray(doubt.compliance or 0.0)
+    parts = (np.asarray(doubt.bias or 0.0), compliance, np.asarray(doubt.friction or 0.0))
+    return np.concatenate([np.broadcast_to(part, motors) for part in parts])
+
+
+def offsets_of(theta: FloatArray, settling: Settling) -> Settling:
+    """Return where motors settle with the offsets of theta beside those that are known.
+
+    Args:
+        theta: With the layout of `Layout`, (theta,).
+        settling: What is known.
+    """
+    offsets = theta[Layout(len(settling.scatter), geometry=False).offsets]
+    bias, compliance, friction = offsets.reshape(3, -1)
+    return replace(
+        settling,
+        bias=tuple((np.asarray(settling.bias) + bias).tolist()),
+        compliance=tuple((np.asarray(settling.compliance) + compliance).tolist()),
+        friction=tuple((np.asarray(settling.friction) + friction).tolist()),
+    )

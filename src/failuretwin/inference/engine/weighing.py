@@ -28,18 +28,19 @@ from failuretwin.inference.engine.posterior import (
 from failuretwin.inference.engine.posterior import most_probable_theta, theta_posterior
 from failuretwin.inference.engine.rows import Scene
 from failuretwin.inference.engine.runs import RunsEvidence, has_rows
-from failuretwin.inference.engine.theta import REGISTRATION, Components, Layout
+from failuretwin.inference.engine.theta import Components, Layout
 from failuretwin.inference.faults.marginal import MarginalLikelihood
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import TransientSamples
-from failuretwin.inference.posterior import Posterior, log_prior, marginal_likelihoods
-from failuretwin.inference.set_ups.set_ups import odd_zero
-from failuretwin.inference.theta.shared_unknowns import (
+from failuretwin.inference.observation.registered import (
+    REGISTRATION,
     registered,
     registered_evidence,
     registered_samples,
 )
+from failuretwin.inference.posterior import Posterior, log_prior, marginal_likelihoods
+from failuretwin.inference.set_ups.set_ups import odd_zero
 
 TOLD = 0.9
 """Probability from which a run says what it had to assume of its robot."""

@@ -75,13 +75,15 @@ class HealthyModel:
         twin: Kinematics.
         imperfections: Offsets, scatter and rates of lost commands.
         scatter_factor: Factor on all scatter and noise; 1 for a robot as it is.
-        untold_noise_m: Noise of the sensor beside what is known of it [m].
+        noise_factor: Factor on the noise of the sensor that is assumed or known.
+        untold_noise_m: Noise of the sensor beside that [m].
         sensing: Names of the sensors that are believed.
     """
 
     twin: DigitalTwin
     imperfections: Imperfections
     scatter_factor: float = 1.0
+    noise_factor: float = 1.0
     untold_noise_m: float = 0.0
     sensing: tuple[str, ...] = TOOL_ALONE
 
@@ -179,7 +181,23 @@ class HealthyModel:
 
         Of an arm whose geometry is fitted, what the fit leaves less what the motors scatter.
         """
-        return float(np.hypot(self.scatter_factor * self._known_noise, self.untold_noise_m))
+        return float(np.hypot(self.noise_factor * self._usual_noise, self.untold_noise_m))
+
+    def with_noise(self, factor: float) -> HealthyModel:
+        """Return the same with a factor on the noise, which stays above the least of such arms."""
+        least = min(self.settings.least_noise_m / self._usual_noise, self.noise_factor)
+        return replace(self, noise_factor=max(self.noise_factor * factor, least))
+
+    @property
+    def _usual_noise(self) -> float:
+        return self.scatter_factor * self._known_noise
+
+    @property
+    def knows_noise(self) -> bool:
+        """Whether somebody has measured the noise of the sensor."""
+        fitted = self.twin.robot.profile.geometry.sensor_noise_m > 0.0
+        known = self.imperfections
+        return fitted or known.settling is None or known.readings is not None
 
     @property
     def _known_noise(self) -> float:

@@ -50,6 +50,11 @@ class SetupPrior(Bounded):
         rates = (self.origin_rate, self.turn_rate, self.scale_rate, self.all_rate)
         return sum(rates) + self.noise_rate
 
+    @property
+    def odds(self) -> float:
+        """Odds that the set-up is off in some way."""
+        return self.doubt / (1.0 - self.doubt)
+
     @classmethod
     def known(cls) -> SetupPrior:
         """Return the belief that robot, sensor and noise are exactly as told."""

@@ -14,14 +14,19 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
-from failuretwin.inference.engine.registration import registered_together, sensor_in_doubt
+from failuretwin.inference.engine.registration import (
+    displaced_components,
+    registered_together,
+    sensor_in_doubt,
+)
+from failuretwin.inference.engine.theta import layout_of, offsets_doubted, robot_components
 from failuretwin.inference.engine.weighing import odd_zeros_of
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.registered import REGISTRATION
 from failuretwin.inference.posterior import Posterior
-from failuretwin.inference.theta.shared_belief import Belief, Normal
-from failuretwin.inference.theta.shared_unknowns import REGISTRATION, components, layout_of
+from failuretwin.inference.together.belief import Belief, Normal
 from failuretwin.inference.together.judged_runs import Judged
 from failuretwin.inference.together.runs_together import RunsTogether
 
@@ -134,18 +139,18 @@ def begun(
     What arms of the kind are like is the prior of theta. The frame of the sensor is known; if the
     runs say that it may not be, it is known or anywhere near, by the odds of the set-up.
     """
-    parts = components(likelihood.model, priors.setup, layout_of(likelihood.model))
-    told = [part for part in parts if not part.name]
-    usual = unit = told[0].deviation
+    model = likelihood.model
+    layout = layout_of(model.without_doubt)
+    believed = robot_components(model, layout, factors=False)
+    usual = unit = np.sqrt(np.diag(believed.usual))
     in_doubt = doubted(likelihood, hypotheses, priors)
     if in_doubt:
-        unit, odds = np.maximum.reduce([part.deviation for part in parts]), priors.setup.doubt
-        moved = float(np.log(odds) - np.log1p(-odds))
-        told += [
-            replace(p, log_weight=p.log_weight + moved, deviation=_in_doubt(p.deviation, unit))
-            for p in told
-        ]
-    together = RunsTogether.of(likelihood, hypotheses, priors, Belief.of(told, unit), unit)
+        unit = displaced_components(model, priors.setup, layout, believed).widest
+    base = Belief.of(believed, unit)
+    if in_doubt:
+        anywhere_near = (np.arange(layout.size) < REGISTRATION).astype(np.float64)
+        base = base.or_moved(anywhere_near, priors.setup.odds)
+    together = RunsTogether.of(likelihood, hypotheses, priors, layout, base, unit)
     if in_doubt:
         together.here[:REGISTRATION] = registered_together(likelihood, hypotheses, priors)
     return together, usual
@@ -158,14 +163,9 @@ def doubted(likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors:
     return sensor_in_doubt(likelihood[some], hypotheses, priors)
 
 
-def _in_doubt(deviation: FloatArray, broad: FloatArray) -> FloatArray:
-    """Return the deviations of theta with a frame that may be anywhere near, (theta,)."""
-    return np.concatenate([broad[:REGISTRATION], deviation[REGISTRATION:]])
-
-
 def _posterior(judged: Judged, here: FloatArray, usual: FloatArray) -> Posterior:
     """Return the posterior of runs, with zeros that are odd by those of their kind."""
     found = judged.weighing.posterior()
-    if len(usual) == REGISTRATION:
+    if not offsets_doubted(judged.weighing.likelihood.model):
         return replace(found, offsets=())
     return replace(found, offsets=odd_zeros_of(judged.weighing, usual, here))

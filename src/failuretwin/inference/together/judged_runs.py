@@ -13,14 +13,15 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.digital_model.nonidealities import Imperfections, LostCommand
+from failuretwin.digital_model.nonidealities import LostCommand
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.posterior import ThetaPart, pooled, theta_factors, theta_parts
 from failuretwin.inference.engine.scatter import outcome_shares, scatter_information
 from failuretwin.inference.engine.weighing import Weighing
-from failuretwin.inference.theta.shared_belief import Belief
-from failuretwin.inference.together.habits import Habits
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.together.belief import Belief
+from failuretwin.inference.together.habits import Habits, log_factors_of
 
 LEAST_TOLD = 1e-3
 """What is less probable is not asked for scatter and losses."""
@@ -79,26 +80,27 @@ class Judged:
         """What each run alone says of theta: Lambda (run, theta, theta) and eta (run, theta)."""
         return theta_factors(self.weighing.evidence)
 
-    def habits(self, given: Imperfections) -> Habits:
+    def habits(self, given: HealthyModel) -> Habits:
         """Return what the runs say of scatter and losses, (run, ...); faulty motors left out.
 
         A motor that is held takes the others where healthy runs do not go, under loads that their
         compliance is stretched to: what is left of those movements is not taken for scatter.
 
         Args:
-            given: What was given of the robot.
+            given: The robot as it was given.
         """
         habits, evidence = Habits.none(self.runs, given), self.weighing.evidence
+        now = log_factors_of(self.weighing.likelihood.model, given)
         for part in self._telling():
             run, weight = part.picks.run, part.weight
             hypothesis = evidence.hypotheses[part.hypothesis]
             outcomes = outcome_shares(evidence, part)
-            for i, entry in enumerate(given.lost_commands):
+            for i, entry in enumerate(given.imperfections.lost_commands):
                 lost = self._losses(entry, hypothesis, part, outcomes)
                 np.add.at(habits.losses[:, i], run, weight[:, None, None] * lost)
             if not _holds(hypothesis):
                 told = scatter_information(evidence, part)
-                shift = told.information @ self._log_scatter(given) + told.score
+                shift = told.information @ now + told.score
                 np.add.at(habits.precision, run, weight[:, None, None] * told.information)
                 np.add.at(habits.shift, run, weight[:, None] * shift)
         return habits
@@ -111,13 +113,6 @@ class Judged:
             np.add.at(total, part.picks.run, part.weight)
         for part in kept:
             yield part.scaled(1.0 / total)
-
-    def _log_scatter(self, given: Imperfections) -> FloatArray:
-        """Return logarithms of scatter and tail beside those given, (motor + 1,)."""
-        now, before = self.weighing.likelihood.model.settling, given.settling
-        assert before is not None
-        tail = np.log(now.tail_dof / before.tail_dof) if np.isfinite(before.tail_dof) else 0.0
-        return np.append(np.log(np.divide(now.scatter, before.scatter)), tail)
 
     def _losses(
         self, entry: LostCommand, hypothesis: Hypothesis, part: ThetaPart, outcomes: FloatArray

@@ -22,20 +22,24 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections
-from failuretwin.inference.engine.registration import registered_together, sensor_in_doubt
+from failuretwin.inference.engine.registration import (
+    displaced_components,
+    registered_together,
+    sensor_in_doubt,
+)
+from failuretwin.inference.engine.theta import (
+    Layout,
+    layout_of,
+    offsets_doubted,
+    robot_components,
+)
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import SettledEvidence, TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.registered import REGISTRATION
 from failuretwin.inference.posterior import Posterior
-from failuretwin.inference.theta.shared_belief import Belief, Normal, summed
-from failuretwin.inference.theta.shared_unknowns import (
-    REGISTRATION,
-    SharedComponent,
-    SharedLayout,
-    components,
-    layout_of,
-)
+from failuretwin.inference.together.belief import Belief, Normal, summed
 from failuretwin.inference.together.folder_posterior import FolderPosterior
 from failuretwin.inference.together.habits import Habits
 from failuretwin.inference.together.runs_together import RunsTogether
@@ -127,12 +131,13 @@ class LifeFilter:
             priors: Beliefs about faults and set-ups.
             limits: How fast and how far it may change.
         """
-        told = [part for part in _components(model, priors) if not part.name]
-        unit = told[0].deviation
-        learns = layout_of(model).offsets and model.imperfections.settling is not None
-        habits = Habits.believed(model.imperfections) if learns else None
-        base = Belief.of(told, unit)
-        begun = _state(base, unit)[None]
+        layout = layout_of(model.without_doubt)
+        believed = robot_components(model, layout, factors=False)
+        unit = np.sqrt(np.diag(believed.usual))
+        learns = offsets_doubted(model) and model.imperfections.settling is not None
+        habits = Habits.believed(model) if learns else None
+        base = Belief.of(believed, unit)
+        begun = _state(base, unit, layout)[None]
         due = FIRST if learns else WINDOW
         return cls(model, hypotheses, priors, limits, unit, base, habits, begun, due=due)
 
@@ -160,13 +165,22 @@ class LifeFilter:
             self.arrived += 1
             if self.arrived % WINDOW == 0:
                 kept = self.limits.horizon // WINDOW
-                self.past = np.concatenate([self.past, _state(self.base, self.unit)[None]])[-kept:]
+                self.past = np.concatenate([self.past, self._state(self.base)[None]])[-kept:]
         self.alarm = self._unlike_wear(window)
         if self.alarm:
             window.counted[:] = False
             window.maximise()
         self.window = self._without_oldest(window)
         return found.weighing.posterior()
+
+    @property
+    def layout(self) -> Layout:
+        """Places in theta."""
+        return layout_of(self.model.without_doubt)
+
+    def _state(self, belief: Belief) -> FloatArray:
+        """Return mean and deviation of the offsets beside those given, (2, 3 motor)."""
+        return _state(belief, self.unit, self.layout)
 
     @property
     def belief(self) -> Belief:
@@ -177,7 +191,7 @@ class LifeFilter:
     def offsets(self) -> tuple[FloatArray, FloatArray]:
         """Mean and deviation of bias, compliance and friction, (3, motor) each [rad, rad/(N m)]."""
         given = np.stack([getattr(self.model.settling, name) for name in OFFSETS])
-        mean, deviation = _state(self.belief, self.unit).reshape(2, *given.shape)
+        mean, deviation = self._state(self.belief).reshape(2, *given.shape)
         return given + mean, deviation
 
     def bias_by_run(self) -> tuple[FloatArray, FloatArray]:
@@ -205,9 +219,14 @@ class LifeFilter:
     @property
     def learned(self) -> Imperfections:
         """The healthy robot with the offsets, scatter and rates that are most probable now."""
+        return self._robot.imperfections
+
+    @property
+    def _robot(self) -> HealthyModel:
+        """The healthy robot that is most probable now."""
         if self.window is None:
-            return self.model.imperfections
-        return self.window.at(self.belief.moments[0][0] * self.unit).imperfections
+            return self.model
+        return self.window.at(self.belief.moments[0][0] * self.unit)
 
     @property
     def told(self) -> FolderPosterior:
@@ -220,7 +239,7 @@ class LifeFilter:
         place[REGISTRATION:] = 0.0
         none = Normal(np.zeros((0, size, size)), np.zeros((0, size)))
         return FolderPosterior(
-            replace(self.model, imperfections=self.learned),
+            self._robot,
             place,
             mean * usual,
             covariance * np.outer(usual, usual),
@@ -306,9 +325,10 @@ class LifeFilter:
 
     def _together(self, evidence: SettledEvidence) -> RunsTogether:
         likelihood = RunLikelihood(evidence, self.model)
-        found = RunsTogether.of(likelihood, self.hypotheses, self.priors, self.base, self.unit)
+        asked = self.hypotheses, self.priors, self.layout
+        found = RunsTogether.of(likelihood, *asked, self.base, self.unit)
         found.habits = self.habits
-        found.here = self.base.moments[0][0] * self.unit
+        found.here = self.layout.place(self.base.moments[0][0] * self.unit)
         found.maximise()
         return found
 
@@ -331,7 +351,7 @@ class LifeFilter:
                 site = Normal(window.sites.precision[one], window.sites.shift[one])
                 self.base = self.base.times(site).pruned()
                 if self.habits is not None:
-                    fading = self.habits.fading(1.0 - 1.0 / REMEMBERED, self.model.imperfections)
+                    fading = self.habits.fading(1.0 - 1.0 / REMEMBERED, self.model)
                     self.habits = fading.plus(window.told[one])
             self.base = self.base.blurred(self._walk)
         kept = slice(old, None)
@@ -342,8 +362,8 @@ class LifeFilter:
     @property
     def _walk(self) -> FloatArray:
         """Variance of the random walk of a run, in units, (theta,)."""
-        step = np.zeros(len(self.unit))
-        step[REGISTRATION:] = self.limits.rate * wear_unit(self.model) / self.unit[REGISTRATION:]
+        step, offsets = np.zeros(len(self.unit)), self.layout.offsets
+        step[offsets] = self.limits.rate * wear_unit(self.model) / self.unit[offsets]
         return step**2
 
     # Where the sensor stands.
@@ -355,12 +375,12 @@ class LifeFilter:
 
     def _look_for_sensor(self, window: RunsTogether) -> None:
         """Let the frame of the sensor be anywhere near, and judge the latest runs anew."""
-        parts = _components(self.model, self.priors)
-        broad = np.maximum.reduce([part.deviation for part in parts])
-        variance = (broad / self.unit) ** 2
+        usual = robot_components(self.model, self.layout, factors=False)
+        asked = self.model, self.priors.setup, self.layout, usual
+        variance = (displaced_components(*asked).widest / self.unit) ** 2
         variance[REGISTRATION:] = 0.0
-        odds = self.priors.setup.doubt / (1.0 - self.priors.setup.doubt)
-        self.moved, self.base = True, self.base.or_moved(variance, odds)
+        self.moved = True
+        self.base = self.base.or_moved(variance, self.priors.setup.odds)
         window.base = self.base
         window.sites.precision[:], window.sites.shift[:] = 0.0, 0.0
         there = registered_together(window.given, self.hypotheses, self.priors)
@@ -385,9 +405,9 @@ class LifeFilter:
             return np.abs(now - known[0]) - most * wear - CHANCE * np.hypot(chance, known[1])
 
         measured = self.habits is None or self.arrived >= 2 * WINDOW
-        behind = (_state(self.base, self.unit), self.past[0]) if measured else ()
+        behind = (self._state(self.base), self.past[0]) if measured else ()
         fast = np.max([np.full_like(now, -np.inf), *(off(k, self.limits.reach) for k in behind)], 0)
-        begun = np.stack([np.zeros_like(wear), self.unit[REGISTRATION:]])
+        begun = np.stack([np.zeros_like(wear), self.unit[self.layout.offsets]])
         excess = np.maximum(fast, off(begun, self.limits.limit))
         over = np.divide(excess, wear, out=np.zeros_like(wear), where=wear > 0.0)
         worst = int(np.argmax(over))
@@ -401,8 +421,8 @@ class LifeFilter:
 
     def _by_itself(self, window: RunsTogether, wear: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return offsets that the latest runs have if any are as good, and their deviation."""
-        anywhere = self._anywhere(slice(REGISTRATION, None), ANYWHERE * wear)
-        return tuple(_state(anywhere.times(summed(window.sites)), self.unit))
+        anywhere = self._anywhere(self.layout.offsets, ANYWHERE * wear)
+        return tuple(self._state(anywhere.times(summed(window.sites))))
 
     def _anywhere(self, free: slice, spread: FloatArray) -> Belief:
         """Return what is believed without the latest runs, but some of theta is anywhere."""
@@ -416,16 +436,11 @@ class LifeFilter:
         return Belief(np.zeros((1, 1)), precision[None, None], (precision @ mean)[None, None])
 
 
-def _components(model: HealthyModel, priors: Priors) -> list[SharedComponent]:
-    """Return what is believed of theta, offsets among it; the first: that all is well."""
-    return components(model, priors.setup, SharedLayout(len(model.scatter), offsets=True))
-
-
-def _state(belief: Belief, unit: FloatArray) -> FloatArray:
+def _state(belief: Belief, unit: FloatArray, layout: Layout) -> FloatArray:
     """Return mean and deviation of the offsets beside those given, (2, 3 motor)."""
     (mean,), (covariance,) = belief.moments
     both = np.stack([mean, np.sqrt(np.diag(covariance))]) * unit
-    return np.asarray(both[:, REGISTRATION:])
+    return np.asarray(both[:, layout.offsets])
 
 
 def _fields(name: str, value: Belief | Normal | Habits) -> dict[str, FloatArray]:

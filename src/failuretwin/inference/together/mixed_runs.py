@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.inference.theta.shared_belief import Normal
+from failuretwin.inference.together.belief import Normal
 
 ODDS_NATS = 7.0
 """Log odds of one robot against two before any run is seen, and how sure it must be; assumed."""

@@ -23,14 +23,14 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.engine.theta import KNOWN, Components, Layout
+from failuretwin.inference.engine.theta import Components, Layout, offsets_doubted, offsets_of
 from failuretwin.inference.engine.weighing import Weighing
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.theta.shared_belief import Belief, Normal, summed
-from failuretwin.inference.theta.shared_unknowns import REGISTRATION, offsets_of
+from failuretwin.inference.observation.registered import REGISTRATION
+from failuretwin.inference.together.belief import Belief, Normal, summed
 from failuretwin.inference.together.habits import Habits
 from failuretwin.inference.together.judged_runs import Judged
 
@@ -50,11 +50,13 @@ class RunsTogether:
         given: The runs, with the model that was given.
         hypotheses: What may be the case.
         priors: Beliefs about faults and set-ups.
+        layout: Places in theta.
         unit: Unit of each part of theta, (theta,).
         base: What is believed of theta without these runs, one mixture, in units.
         sites: What each run says, in units.
         here: Where runs are expanded, (theta,).
-        habits: What is believed of scatter and losses without these runs; None: they are known.
+        habits: What is believed of scatter, noise and losses without these runs; None: they are
+            known.
         told: What each run says of them.
         counted: Whether others are judged with what each says, (run,).
         model: The healthy robot with scatter and rates that were learned.
@@ -63,6 +65,7 @@ class RunsTogether:
     given: RunLikelihood
     hypotheses: Sequence[Hypothesis]
     priors: Priors
+    layout: Layout
     unit: FloatArray
     base: Belief
     sites: Normal
@@ -82,6 +85,7 @@ class RunsTogether:
         likelihood: RunLikelihood,
         hypotheses: Sequence[Hypothesis],
         priors: Priors,
+        layout: Layout,
         base: Belief,
         unit: FloatArray,
     ) -> RunsTogether:
@@ -91,22 +95,23 @@ class RunsTogether:
             likelihood: The runs.
             hypotheses: What may be the case.
             priors: Beliefs about faults and set-ups.
+            layout: Places in theta.
             base: What is believed before, in units.
             unit: Unit of each part of theta, (theta,).
         """
-        size, runs = len(unit), len(likelihood.usable)
-        given = likelihood.model.imperfections
-        learns = size > REGISTRATION and given.settling is not None
+        size, runs, model = layout.size, len(likelihood.usable), likelihood.model
+        learns = offsets_doubted(model) and model.imperfections.settling is not None
         return cls(
             likelihood,
             hypotheses,
             priors,
+            layout,
             unit,
             base,
             Normal(np.zeros((runs, size, size)), np.zeros((runs, size))),
             np.zeros(size),
-            Habits.believed(given) if learns else None,
-            Habits.none(runs, given),
+            Habits.believed(model) if learns else None,
+            Habits.none(runs, model),
             np.ones(runs, dtype=bool),
         )
 
@@ -127,7 +132,7 @@ class RunsTogether:
 
     def at(self, theta: FloatArray) -> HealthyModel:
         """Return the healthy robot with some offsets beside those given."""
-        if len(theta) == REGISTRATION:
+        if self.model.imperfections.settling is None:
             return self.model
         imperfections, given = self.model.imperfections, self.given.model.settling
         now = self.model.settling
@@ -185,10 +190,22 @@ class RunsTogether:
             self.sites.precision[rows] += damping * (site.precision - old.precision)
             self.sites.shift[rows] += damping * (site.shift - old.shift)
             if self.habits is not None:
-                told = judged.habits(self.given.model.imperfections)
+                told = judged.habits(self.given.model)
                 self.told.put(rows, self.told[rows].toward(told, of_habits))
+        self._wait_for_scales(np.concatenate([judged.rows for judged in found]))
         self.maximise()
-        self.here = self.belief.moments[0][0] * self.unit
+        self.here = self.layout.place(self.belief.moments[0][0] * self.unit)
+
+    def _wait_for_scales(self, rows: IntArray) -> None:
+        """Let what some runs say of tails wait until scatter and noise are found."""
+        if self.habits is not None and not self._habits.settled(self.model, self.given.model):
+            self.told.forget_tails(rows)
+
+    @property
+    def _habits(self) -> Habits:
+        """What is believed of scatter, noise and losses with these runs."""
+        assert self.habits is not None
+        return self.habits.plus(self.told[np.flatnonzero(self.counted)])
 
     def alone(self, judged: Judged) -> Normal:
         """Return what each run says without any belief, in units; before it is learned.
@@ -196,20 +213,14 @@ class RunsTogether:
         A site is less apt: it also says which component of the belief is true, which narrows what a
         run by itself leaves open.
         """
-        size = len(self.unit)
         information, shift = judged.factors
-        information, shift = information[:, :size, :size], shift[:, :size]
         shift = shift + information @ self.here
         return Normal(information * np.outer(self.unit, self.unit), shift * self.unit)
 
     def maximise(self) -> None:
-        """Take the scatter and the rates that explain the runs best."""
-        if self.habits is None:
-            return
-        given = self.given.model
-        told = self.habits.plus(self.told[np.flatnonzero(self.counted)])
-        known = told.most_probable(given.imperfections)
-        self.model = replace(given, imperfections=known)
+        """Take the scatter, the noise and the rates that explain the runs best."""
+        if self.habits is not None:
+            self.model = self._habits.most_probable(self.given.model)
 
     def _cavity(self, rows: IntArray) -> Belief:
         """Return the belief without the sites of some runs, each without its own."""
@@ -232,11 +243,11 @@ class RunsTogether:
             RunLikelihood(self.given.evidence[rows], model, moving),
             self.hypotheses,
             self.priors,
-            Layout(len(model.scatter), geometry=False),
+            self.layout,
             self._components(used, float(np.hypot(model.path_noise, noise_m))),
             np.tile(self.here[:REGISTRATION], (len(rows), 1)),
             asked,
-            self._in_full(self.belief.moments[1] * np.outer(self.unit, self.unit))[0],
+            self.belief.moments[1][0] * np.outer(self.unit, self.unit),
         )
         return Judged(rows, weighing, used, self._loose[some])
 
@@ -245,8 +256,6 @@ class RunsTogether:
         covariance: FloatArray = np.asarray(np.linalg.inv(belief.precision))
         mean = np.einsum("rctu,rcu->rct", covariance, belief.shift) * self.unit - self.here
         covariance = np.asarray(covariance * np.outer(self.unit, self.unit))
-        covariance = self._in_full(covariance)
-        mean = np.pad(mean, ((0, 0), (0, 0), (0, covariance.shape[-1] - len(self.unit))))
         count = mean.shape[1]
         return Components(
             belief.log_weight,
@@ -257,14 +266,6 @@ class RunsTogether:
             np.full(count, noise_m),
             np.zeros(count, dtype=bool),
         )
-
-    def _in_full(self, covariance: FloatArray) -> FloatArray:
-        """Return covariances (..., theta, theta) with known offsets where theta has none."""
-        size, whole = len(self.unit), REGISTRATION + 3 * len(self.model.scatter)
-        found = np.zeros((*covariance.shape[:-2], whole, whole))
-        found[..., np.arange(whole), np.arange(whole)] = KNOWN**2
-        found[..., :size, :size] = covariance
-        return found
 
     @property
     def _loose(self) -> BoolArray:
@@ -287,8 +288,8 @@ class RunsTogether:
         for loose in np.unique(judged.loose).tolist():
             weight, mean, covariance = judged.moments(loose)
             some = np.flatnonzero(weight > LEAST_SHARE)
-            mean = (mean[some, :size] + self.here) / self.unit
-            spread = covariance[some, :size, :size] / np.outer(self.unit, self.unit)
+            mean = (mean[some] + self.here) / self.unit
+            spread = covariance[some] / np.outer(self.unit, self.unit)
             cavity = judged.cavity.only(np.flatnonzero(judged.loose == loose)).matched()[some]
             site = _beside(cavity, mean, spread)
             told.precision[some] += weight[some, None, None] * site.precision

@@ -13,14 +13,13 @@ Section: docs/inference.md#shared-unknowns
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.theta.shared_unknowns import SharedComponent
+from failuretwin.inference.engine.theta import Components
 
 LEAST_PRECISION = 1e-9
 """Of a belief without some of its sites, in units of the prior's."""
@@ -65,18 +64,18 @@ class Belief:
     shift: FloatArray
 
     @classmethod
-    def of(cls, components: Sequence[SharedComponent], unit: FloatArray) -> Belief:
+    def of(cls, components: Components, unit: FloatArray) -> Belief:
         """Return what is believed before any run, one mixture.
 
         Args:
-            components: What is believed of theta.
+            components: What is believed of theta, the same of all runs.
             unit: Unit of each part of theta, (theta,).
         """
-        log_weight = np.array([part.log_weight for part in components])
-        deviation = np.array([part.deviation for part in components]) / unit
-        precision = deviation[:, :, None] ** -2.0 * np.eye(len(unit))
-        log_weight = log_weight - log_sum(log_weight, axis=0)
-        return cls(log_weight[None], precision[None], np.zeros((1, *deviation.shape)))
+        precision = np.asarray(np.linalg.inv(components.covariance / np.outer(unit, unit)))
+        shift: FloatArray = np.einsum("ctu,cu->ct", precision, components.mean / unit)
+        log_weight = components.log_weight - log_sum(components.log_weight, axis=0)
+        each = components.normal
+        return cls(log_weight[None], precision[None, each], shift[None, each])
 
     def __getitem__(self, component: int) -> Normal:
         """Return one component alone."""
