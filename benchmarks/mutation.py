@@ -80,16 +80,15 @@ AREAS: dict[str, tuple[str, ...]] = {
         "tests/decision/test_isolability.py",
     ),
     "inference/explanation.py": ("tests/decision/test_wording.py",),
-    "inference/theta/shared_unknowns.py": ("tests/decision/test_shared_unknowns.py",),
+    "inference/engine/theta.py": ("tests/decision/test_shared_unknowns.py",),
     "inference/engine/scatter.py": (
         "tests/connection/test_life_filter.py",
         "tests/decision/test_folder_posterior.py",
     ),
     "inference/engine/registration.py": ("tests/decision/test_shared_posterior.py",),
     "inference/engine/weighing.py": ("tests/decision/test_shared_posterior.py",),
-    "inference/theta/shared_posterior.py": ("tests/decision/test_shared_posterior.py",),
     "inference/together/folder_posterior.py": ("tests/decision/test_folder_posterior.py",),
-    "inference/theta/shared_belief.py": (
+    "inference/together/belief.py": (
         "tests/decision/test_folder_posterior.py",
         "tests/connection/test_life_filter.py",
     ),

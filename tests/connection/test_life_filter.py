@@ -30,7 +30,6 @@ from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.together.belief import Belief, Normal
-from failuretwin.inference.theta.shared_unknowns import SharedComponent
 from failuretwin.inference.together.life_filter import CHANCE, MOST_DOUBT, WINDOW
 from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
 
@@ -52,11 +51,12 @@ def motor_2(counts):
 @pytest.fixture
 def belief():
     """A usual robot and an odd one, of two numbers."""
+    unit = np.array([1.0, 0.5])
     parts = [
-        SharedComponent("", float(np.log(0.9)), np.array([1.0, 0.5])),
-        SharedComponent("", float(np.log(0.1)), np.array([3.0, 1.5])),
+        Components.normal_of(np.diag((factor * unit) ** 2), 0.0).weighted(rate)
+        for factor, rate in ((1.0, 0.9), (3.0, 0.1))
     ]
-    return Belief.of(parts, np.array([1.0, 0.5]))
+    return Belief.of(Components.joined(parts), unit)
 
 
 def on_grid(belief_density):

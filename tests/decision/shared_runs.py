@@ -11,14 +11,11 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.settling import Settling
 from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.inference.engine.theta import offsets_of
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.theta.shared_unknowns import (
-    SharedLayout,
-    offsets_of,
-    registered_evidence,
-)
+from failuretwin.inference.observation.registered import registered_evidence
 
 SETTLING = Settling(
     bias=(0.01, -0.02, 0.03, -0.01),
@@ -31,7 +28,6 @@ DOUBT = Variation(bias=(0.01,) * 4, compliance=(0.3,) * 4, friction=(0.004,) * 4
 WIDTH = np.array([0.003] * 3 + [0.01] * 4 + [0.01] * 4 + [0.03] * 4 + [0.004] * 4)
 """About how far each part of theta may be off."""
 FAULTS = ["motor_2:stuck", "motor_3:steady_state_error", "motor_2:encoder_bias", "motor_4:drift"]
-WHOLE, FRAME = SharedLayout(4, True), SharedLayout(4, False)
 
 
 @dataclass(frozen=True)

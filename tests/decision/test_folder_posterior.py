@@ -22,18 +22,18 @@ from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import Imperfections, LostCommand
 from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.inference.engine import theta as engine_theta
 from failuretwin.inference.engine.registration import robot_evidence
+from failuretwin.inference.engine.theta import offsets_of
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import log_prior
-from failuretwin.inference.theta import shared_unknowns
-from failuretwin.inference.together.belief import mixed as moments_of
-from failuretwin.inference.together.belief import positive
-from failuretwin.inference.theta.shared_unknowns import offsets_of
 from failuretwin.inference.together import folder_posterior as folder
 from failuretwin.inference.together import habits, runs_together
+from failuretwin.inference.together.belief import mixed as moments_of
+from failuretwin.inference.together.belief import positive
 from failuretwin.inference.together.folder_posterior import folder_posterior
 
 SURE = Priors(setup=SetupPrior.known())
@@ -195,7 +195,7 @@ def gaussian(twin):
     one = drawn_from_its_model(scene(twin, "healthy", runs=5, seed=4))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(habits, "SCATTER_SPREAD", 1e-6)
-        patch.setattr(shared_unknowns, "ODD_FACTOR", 1.0)
+        patch.setattr(engine_theta, "ODD_FACTOR", 1.0)
         found = folder_posterior(RunLikelihood(one.evidence, one.model), HEALTHY, SURE)
     return one, found
 
@@ -252,16 +252,17 @@ def test_scatter_is_where_its_posterior_is_highest(twin, monkeypatch):
     wide = replace(one.evidence, point=one.evidence.point + 0.002 * np.eye(6, 3)[:, None])
     one = replace(one, evidence=wide)
     monkeypatch.setattr(folder, "PASSES", 12)
-    monkeypatch.setattr(shared_unknowns, "ODD_FACTOR", 1.0)
+    monkeypatch.setattr(engine_theta, "ODD_FACTOR", 1.0)
     found = folder_posterior(RunLikelihood(one.evidence, one.model), HEALTHY, SURE)
-    best = optimize.minimize(scatter_height(one, found.mean), np.zeros(4), method="BFGS").x
-    learned = np.log(np.array(found.model.settling.scatter) / SETTLING.scatter)
+    best = optimize.minimize(scatter_height(one, found.mean), np.zeros(5), method="BFGS").x
+    learned = np.array(found.model.settling.scatter) / SETTLING.scatter
+    learned = np.log([*learned, found.model.path_noise / one.model.path_noise])
     np.testing.assert_allclose(learned, best, atol=0.02)
     assert (np.abs(best) > 0.05).any()
 
 
 def scatter_height(one, theta):
-    """Return minus the log posterior of the log scatter beside that given, as a function of it."""
+    """Return minus the log posterior of log scatter and noise beside those given, by these."""
     evidence, model = one.evidence, one.model.without_doubt
     target = evidence.movements.target
     direction = np.sign(target - evidence.movements.origin()).reshape(-1, 4)
@@ -285,11 +286,13 @@ def scatter_height(one, theta):
     common = design * prior @ (design * prior).T
 
     def height(change):
-        lever = jacobian * np.array(SETTLING.scatter) * np.exp(change)
-        own = lever @ np.swapaxes(lever, 1, 2) + model.path_noise**2 * np.eye(3)
+        lever = jacobian * np.array(SETTLING.scatter) * np.exp(change[:4])
+        noise = model.path_noise * np.exp(change[4])
+        own = lever @ np.swapaxes(lever, 1, 2) + noise**2 * np.eye(3)
         covariance = common + block_diag(*own)
         square = off @ np.linalg.solve(covariance, off)
-        return 0.5 * (square + np.linalg.slogdet(covariance)[1] + np.sum((change / 0.3) ** 2))
+        prior = np.sum((change / np.array([0.3] * 4 + [1.2])) ** 2)
+        return 0.5 * (square + np.linalg.slogdet(covariance)[1] + prior)
 
     return height
 

@@ -21,14 +21,14 @@ from failuretwin.inference.engine.registration import (
     registered_each,
     registered_together,
     robot_evidence,
+    run_posterior,
     sensor_in_doubt,
 )
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.registered import registered_evidence
 from failuretwin.inference.posterior import compute_posterior, log_prior, marginal_likelihood_of
-from failuretwin.inference.engine.registration import run_posterior
-from failuretwin.inference.theta.shared_unknowns import registered_evidence
 
 KNOWN = Imperfections("made up", "test", settling=replace(SETTLING, tail_dof=5.0))
 DOUBTED = replace(KNOWN, variation=DOUBT)

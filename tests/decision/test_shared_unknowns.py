@@ -11,20 +11,24 @@ from scipy.spatial.transform import Rotation
 from failuretwin import SetupPrior
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.engine.theta import Layout, columns
-from failuretwin.inference.observation.evidence import SettledEvidence, TransientSamples
-from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.theta.shared_unknowns import (
-    SharedLayout,
-    components,
-    layout_of,
+from failuretwin.inference.engine.registration import displaced_components
+from failuretwin.inference.engine.theta import (
+    KNOWN,
+    Layout,
+    columns,
     loads,
     offset_deviation,
+    offsets_doubted,
     offsets_of,
+    robot_components,
+    typical_load,
+)
+from failuretwin.inference.observation.evidence import SettledEvidence, TransientSamples
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.registered import (
     registered,
     registered_evidence,
     registered_samples,
-    typical_load,
 )
 
 RIGID = Settling(
@@ -104,11 +108,12 @@ def test_a_motor_gives_way_by_its_load_in_the_logs_sense(twin):
 
 
 def test_layout_of_theta():
-    whole, frame = SharedLayout(4, True), SharedLayout(4, False)
-    assert (whole.size, frame.size) == (19, 7)
-    engine = Layout(4, geometry=False)
-    assert engine.size == whole.size
-    assert [engine.own(motor) for motor in (0, 3)] == [[7, 11, 15], [10, 14, 18]]
+    plain, whole = Layout(4, geometry=False), Layout(4, geometry=True, moving=True)
+    assert (plain.size, whole.size) == (19, 47)
+    assert [plain.own(motor) for motor in (0, 3)] == [[7, 11, 15], [10, 14, 18]]
+    assert (whole.offsets, whole.frames, whole.lags) == (slice(7, 19), slice(19, 43), slice(43, 47))
+    place = whole.place(np.ones(47))
+    assert (place[:19].sum(), place[19:].sum()) == (19.0, 0.0)  # frames and lags stay linear
 
 
 def test_offsets_are_added_to_those_that_are_known():
@@ -173,36 +178,44 @@ def test_doubt_is_the_sum_of_the_rates():
     )
 
 
+PLAIN = Layout(4, geometry=False)
+
+
+def believed(model, prior):
+    """Return what is believed of a robot whose sensor may be displaced, and how wide it is."""
+    usual = robot_components(model, PLAIN, factors=False)
+    found = displaced_components(model, prior, PLAIN, usual)
+    variance = np.diagonal(found.covariance, axis1=1, axis2=2)
+    return found, np.sqrt(variance)[found.normal]
+
+
 @pytest.mark.parametrize("prior", [SetupPrior(), SetupPrior.known(), SetupPrior(turn_rate=0.3)])
-@pytest.mark.parametrize("offsets", [True, False])
-def test_probabilities_of_all_components_sum_to_one(twin, prior, offsets):
-    variation = Variation(bias=(0.02,) * 4)
-    found = components(model_of(twin, YIELDING, variation), prior, SharedLayout(4, offsets))
-    assert np.exp([part.log_weight for part in found]).sum() == pytest.approx(1.0, abs=1e-12)
-    as_told = [np.exp(part.log_weight) for part in found if not part.name]
+@pytest.mark.parametrize("doubt", [Variation(bias=(0.02,) * 4), None])
+def test_probabilities_of_all_components_sum_to_one(twin, prior, doubt):
+    found, _ = believed(model_of(twin, YIELDING, doubt), prior)
+    assert np.exp(found.log_weight).sum() == pytest.approx(1.0, abs=1e-12)
+    as_told = np.exp(found.log_weight[: 1 if doubt is None else 2])
     well = 1.0 - prior.doubt
-    assert as_told == pytest.approx([0.9 * well, 0.1 * well] if offsets else [well])
-    assert all(len(part.deviation) == (19 if offsets else 7) for part in found)
+    assert as_told.tolist() == pytest.approx([well] if doubt is None else [0.9 * well, 0.1 * well])
+    assert found.mean.shape[-1] == 19
 
 
 def test_components_are_as_wide_as_the_prior_says(twin):
-    found = components(model_of(twin, RIGID), SetupPrior(), SharedLayout(4, False))
-    assert [part.name for part in found] == [
-        *("", "origin", "origin", "turn", "turn", "scale", "frame", "noise", "noise")
-    ]
-    weights = np.exp([part.log_weight for part in found])
-    np.testing.assert_allclose(weights, [0.45, 0.08, 0.08, 0.08, 0.08, 0.07, 0.08, 0.04, 0.04])
-    table = np.array([part.deviation for part in found])
-    origin = np.array([0.0, 0.0065, 0.026, 0.0, 0.0, 0.0, 0.01625, 0.0, 0.0]) * REACH
-    turn = np.array([0.0, 0.0, 0.0, 0.0087, 0.035, 0.0, 0.02185, 0.0, 0.0])
-    scale = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.015, 0.015, 0.0, 0.0])
+    model = model_of(twin, RIGID)
+    found, table = believed(model, SetupPrior())
+    weights = np.exp(found.log_weight)
+    np.testing.assert_allclose(weights, [0.45, 0.04, 0.04, 0.08, 0.08, 0.08, 0.08, 0.08, 0.07])
+    assert found.displaced.tolist() == [False] * 3 + [True] * 6
+    origin = np.array([0.0, 0.0, 0.0, 0.01625, 0.0065, 0.026, 0.0, 0.0, 0.0]) * REACH
+    turn = np.array([0.0, 0.0, 0.0, 0.02185, 0.0, 0.0, 0.0087, 0.035, 0.0])
+    scale = np.array([0.0, 0.0, 0.0, 0.015, 0.0, 0.0, 0.0, 0.0, 0.015])
     for place, expected in ((slice(3), origin), (slice(3, 6), turn), (slice(6, 7), scale)):
         narrow = table[:, place].max(axis=1)
-        np.testing.assert_allclose(narrow, expected, rtol=1e-5, atol=4e-7)
+        np.testing.assert_allclose(narrow, expected, rtol=1e-5, atol=2.0 * KNOWN)
         assert (table[:, place] == narrow[:, None]).all()
         assert (table[:, place] > 0.0).all()
-    noise = [part.noise_m for part in found]
-    np.testing.assert_allclose(noise, np.array([0.0] * 7 + [0.004, 0.01]) * REACH, rtol=1e-5)
+    noise = np.hypot(model.path_noise, np.array([0.0, 0.004, 0.01] + [0.0] * 6) * REACH)
+    np.testing.assert_allclose(found.noise_m, noise, rtol=1e-5)
 
 
 def test_offsets_are_as_wide_as_the_doubt_of_the_robot(twin):
@@ -211,15 +224,14 @@ def test_offsets_are_as_wide_as_the_doubt_of_the_robot(twin):
     model = model_of(twin, YIELDING, doubt)
     wide = [0.02] * 4 + [0.0, 0.05, 0.075, 0.1] + [0.01, 0.02, 0.03, 0.04]
     np.testing.assert_allclose(offset_deviation(model), wide)
-    usual, odd, *others = components(model, SetupPrior(), SharedLayout(4, True))
-    own = usual.deviation[7:]
+    _, (usual, odd, *others) = believed(model, SetupPrior())
+    own = usual[7:]
     np.testing.assert_allclose(np.delete(own, 4), np.delete(wide, 4))
     assert 0.0 < own[4] < 0.002  # of a motor without a load nothing shows it
-    np.testing.assert_allclose(odd.deviation[7:], 3.0 * usual.deviation[7:])
-    np.testing.assert_array_equal(odd.deviation[:7], usual.deviation[:7])
+    np.testing.assert_allclose(np.delete(odd[7:], 4), np.delete(3.0 * own, 4))
+    np.testing.assert_array_equal(odd[:7], usual[:7])
     for part in others:
-        np.testing.assert_array_equal(part.deviation[7:], usual.deviation[7:])
-    assert usual.deviation.min() > 0.0
+        np.testing.assert_array_equal(part[7:], own)
     assert offset_deviation(model_of(twin, YIELDING)).tolist() == [0.0] * 12
 
 
@@ -239,7 +251,7 @@ def test_offsets_are_as_wide_as_the_doubt_of_the_robot(twin):
 def test_offsets_are_in_doubt_from_half_the_scatter_on(twin, doubt, matters):
     """Of motor 2: 0.1 rad/(N m) under 0.166 N m, so 18 % of that is 0.0030 rad of 0.005."""
     model = model_of(twin, replace(YIELDING, payload=0.0), doubt)
-    assert layout_of(model) == SharedLayout(4, matters)
+    assert offsets_doubted(model) == matters
 
 
 def test_typical_load_is_the_rms_over_the_range(twin):

@@ -27,11 +27,11 @@ from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import LostCommand, Readings
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference import seen_runs
+from failuretwin.inference.engine import registration
 from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
 from failuretwin.inference.faults.priors import MONITORING, priors_of
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.log_quality import log_quality
-from failuretwin.inference.theta import shared_posterior
 
 __all__ = [
     "MODES",
@@ -90,10 +90,10 @@ def with_log_evidence(diagnoser, runs):
     kept = []
 
     def weighed(*arguments):
-        kept.append(shared_posterior.shared_posterior(*arguments))
+        kept.append(registration.run_posterior(*arguments))
         return kept[-1]
 
-    with mock.patch.object(seen_runs, "shared_posterior", weighed):
+    with mock.patch.object(seen_runs, "run_posterior", weighed):
         diagnoses = diagnoser.diagnose(runs)
     says = [np.stack([weight.log_evidence for weight in j.weights], axis=1) for j in kept]
     return diagnoses, np.concatenate(says)

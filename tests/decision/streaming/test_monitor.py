@@ -15,8 +15,8 @@ from failuretwin.decision.streaming.learning import RUN, LifeLearner
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import LostCommand, Schedule, Timing
+from failuretwin.inference.engine.theta import offsets_of
 from failuretwin.inference.observation.evidence import SettledEvidence
-from failuretwin.inference.theta.shared_unknowns import offsets_of
 
 
 def answers(watch, samples):

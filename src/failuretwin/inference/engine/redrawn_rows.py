@@ -18,8 +18,8 @@ from failuretwin.inference.engine.outcomes import Outcomes
 from failuretwin.inference.engine.rows import Rows, Scene, sampled
 from failuretwin.inference.faults.priors import OnsetIntervals
 
-RATIO = 100.0 ** (1.0 / 16.0)
-"""Ratio of one node of the size to the next, on each side of zero."""
+NODES, DECADE = 16, 8
+"""Nodes of the size on each side of zero, in a constant ratio: at least, and in a factor of 10."""
 SMALLEST = 1e-2
 """Smallest node, as a share of the largest size, where sizes begin at nothing."""
 
@@ -30,7 +30,7 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
     sizes = scene.priors.sizes_of(mode, model, motor)
     low, high = sizes.ends
     smallest = low if low > 0.0 else SMALLEST * high
-    count = max(1, int(np.ceil(np.log(high / smallest) / np.log(RATIO))))
+    count = max(NODES, int(np.ceil(DECADE * np.log10(high / smallest))))
     edge = np.geomspace(smallest, high, count + 1)
     node, width = np.sqrt(edge[1:] * edge[:-1]), np.diff(edge)
     size, width = np.r_[-node[::-1], node], np.r_[width[::-1], width]

@@ -232,8 +232,13 @@ def columns(
 
 
 def has_geometry(model: HealthyModel) -> bool:
-    """Return whether joint frames show: not where the path is computed from motor readings."""
-    return model.sensors.tool_alone and model.twin.robot.profile.sensor_pose != "log"
+    """Return whether joint frames are in doubt.
+
+    They do not show where the path is computed from motor readings. What they leave of a robot that
+    was calibrated, or whose geometry was fitted, is in the scatter and the noise that were found.
+    """
+    shows = model.sensors.tool_alone and model.twin.robot.profile.sensor_pose != "log"
+    return shows and not model.knows_noise
 
 
 def layout_of(model: HealthyModel, moving: bool = False) -> Layout:
