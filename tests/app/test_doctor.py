@@ -45,8 +45,8 @@ def test_what_is_found_can_be_accepted(failuretwin, reversed_log, tmp_path):
 def test_a_shift_of_the_tool_is_no_other_robot_and_can_be_accepted(
     failuretwin, simulated, tmp_path
 ):
-    runs = load_run_set(simulated).isel(run=[0, 0, 0, 2])
-    runs = runs.assign_coords(run=[f"run_{i}" for i in range(4)])
+    runs = load_run_set(simulated).isel(run=[0, 0, 2])
+    runs = runs.assign_coords(run=[f"run_{i}" for i in range(3)])
     off, fix = tmp_path / "off.nc", tmp_path / "map.toml"
     save_run_set(runs.assign(measured=runs["measured"] + [0.0, 0.0, 0.008]), off)
     told = failuretwin("doctor", off, "--out", fix).stdout

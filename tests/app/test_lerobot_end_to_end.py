@@ -31,6 +31,8 @@ import pyarrow.parquet as pq  # noqa: E402
 DEG_PER_COUNT = 360.0 / 4096.0
 STATE = "observation.state"
 ROOT = Path(__file__).parents[2]
+SO101 = ("--robot", "so101", "--hypotheses", "healthy,motor_2:stuck")
+"""Where what is offered does not matter: offsets are not found by the diagnosis."""
 
 
 @pytest.fixture(scope="module")
@@ -154,8 +156,8 @@ def test_a_guess_is_said_and_one_option_settles_it(failuretwin, tmp_path, health
     folder = write_episodes(tmp_path / "pick", rough, V3)
     (tmp_path / "map.toml").write_text('[lerobot]\nunit = "deg"\n')
 
-    guess = failuretwin("diagnose", folder, "--robot", "so101")
-    told = failuretwin("diagnose", folder, "--robot", "so101", "--columns", tmp_path / "map.toml")
+    guess = failuretwin("diagnose", folder, *SO101)
+    told = failuretwin("diagnose", folder, *SO101, "--columns", tmp_path / "map.toml")
 
     assert guess.returncode == told.returncode == 0, guess.stderr + told.stderr
     assert re.search(r"note: LeRobot v3.0, angles in deg \(guessed: .*--columns", guess.stderr)
@@ -167,11 +169,13 @@ def test_a_guess_is_said_and_one_option_settles_it(failuretwin, tmp_path, health
 def test_episodes_are_diagnosed_alone_and_as_a_life(failuretwin, tmp_path, version):
     stuck = simulated_counts(4, seed=3, hypothesis="motor_2:stuck")
     folder = written(tmp_path / "pick", stuck, version=version)
-    common = ("diagnose", folder, "--robot", "so101", "--json", tmp_path / "found.jsonl")
+    told = ("--json", tmp_path / "found.jsonl")
 
-    alone = failuretwin(*common)
+    alone = failuretwin("diagnose", folder, "--robot", "so101", *told)
     records = [json.loads(line) for line in (tmp_path / "found.jsonl").read_text().splitlines()]
-    life = failuretwin(*common, "--track", "--out", tmp_path / "mine.toml")
+    life = failuretwin(
+        "diagnose", folder, *SO101, *told, "--track", "--out", tmp_path / "mine.toml"
+    )
 
     assert alone.returncode == life.returncode == 0, alone.stderr + life.stderr
     assert [one["run"] for one in records] == [f"pick/episode_{k:06d}" for k in range(4)]
@@ -275,7 +279,7 @@ def test_the_copy_differs_in_the_joint_that_is_displaced_alone(
     source = written(tmp_path / "pick", with_offset(healthy, 3, 5.0), unit, version, dtype)
     out = tmp_path / "fixed"
 
-    done = failuretwin("diagnose", source, "--robot", "so101", "--correct", out)
+    done = failuretwin("diagnose", source, *SO101, "--correct", out)
 
     assert done.returncode == 0, done.stderr
     assert "joint offset: motor 4 (wrist flex) reads +" in done.stdout
@@ -296,7 +300,7 @@ def test_the_copy_differs_in_the_joint_that_is_displaced_alone(
         expected[3] = np.rint(joint["added"]) if dtype == "int64" else joint["added"]
         np.testing.assert_allclose(moved, np.broadcast_to(expected, moved.shape), atol=2e-5)
 
-    again = failuretwin("diagnose", out, "--robot", "so101", "--correct", tmp_path / "more")
+    again = failuretwin("diagnose", out, *SO101, "--correct", tmp_path / "more")
 
     assert again.returncode == 2
     assert "nothing to correct: no joint offset has a probability of 95 %" in again.stderr
@@ -309,7 +313,7 @@ def test_statistics_move_along(failuretwin, tmp_path, healthy, version):
     source = written(tmp_path / "pick", with_offset(healthy, 0, -5.0), version=version)
     out = tmp_path / "fixed"
 
-    assert failuretwin("diagnose", source, "--robot", "so101", "--correct", out).returncode == 0
+    assert failuretwin("diagnose", source, *SO101, "--correct", out).returncode == 0
 
     state = [np.stack(table[STATE].to_numpy()) for table in tables(out).values()]
     whole = json.loads((out / "meta" / "stats.json").read_text())
@@ -330,7 +334,7 @@ def test_statistics_move_along(failuretwin, tmp_path, healthy, version):
 def test_a_stuck_motor_is_not_corrected(failuretwin, tmp_path):
     source = written(tmp_path / "pick", simulated_counts(3, 3, "motor_2:stuck"))
 
-    done = failuretwin("diagnose", source, "--robot", "so101", "--correct", tmp_path / "fixed")
+    done = failuretwin("diagnose", source, *SO101, "--correct", tmp_path / "fixed")
 
     assert done.returncode == 2
     assert "nothing to correct" in done.stderr
@@ -358,9 +362,7 @@ def test_wrong_calls_are_refused_before_any_work(failuretwin, tmp_path, healthy)
 def test_a_full_disk_leaves_nothing_behind(failuretwin, tmp_path, healthy):
     source = written(tmp_path / "pick", with_offset(healthy, 3, 5.0))
 
-    done = failuretwin(
-        "diagnose", source, "--robot", "so101", "--correct", tmp_path / "fixed", disk_full=True
-    )
+    done = failuretwin("diagnose", source, *SO101, "--correct", tmp_path / "fixed", disk_full=True)
 
     assert done.returncode == 2
     assert [p.name for p in tmp_path.iterdir()] == ["pick"]
@@ -373,9 +375,7 @@ def test_a_real_log_is_corrected_and_read_again(failuretwin, tmp_path, teleopera
     shift[3] = 5.0  # about 5 deg of a range of 201
     write_shifted(teleoperated, tmp_path / "off", shift, {"made": "by hand"})
 
-    done = failuretwin(
-        "diagnose", tmp_path / "off", "--robot", "so101", "--correct", tmp_path / "fixed"
-    )
+    done = failuretwin("diagnose", tmp_path / "off", *SO101, "--correct", tmp_path / "fixed")
 
     assert done.returncode == 0, done.stderr
     notes = json.loads((tmp_path / "fixed" / "meta" / "correction.json").read_text())

@@ -16,7 +16,7 @@ from waiting import WAIT_S
 pytest.importorskip("mcap")
 pytest.importorskip("mujoco")
 
-FAULT = ("--fault", "motor_3:stuck@12-25")
+FAULT = ("--fault", "motor_3:stuck@12-22")
 TOLD = re.compile(r"^ *([\d.]+) s  (.*)$", re.MULTILINE)
 
 
@@ -30,7 +30,7 @@ def watched(failuretwin, tmp_path_factory):
     """What was said of the same robot while it was recorded, and the recording."""
     path = tmp_path_factory.mktemp("watched") / "live.mcap"
     answer = failuretwin(
-        *("watch", "emulated", "--speed", 0, "--seconds", 45, "--record", path), *FAULT
+        *("watch", "emulated", "--speed", 0, "--seconds", 38, "--record", path), *FAULT
     )
     assert answer.returncode == 0, answer.stderr
     return answer, path
@@ -38,9 +38,9 @@ def watched(failuretwin, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def recording(failuretwin, tmp_path_factory):
-    """An emulated robot of which motor 3 sticks from 12 to 25 s, as a file."""
+    """An emulated robot of which motor 3 sticks from 12 to 22 s, as a file."""
     path = tmp_path_factory.mktemp("live") / "robot.mcap"
-    answer = failuretwin("emulate", "--to", path, "--seconds", 45, *FAULT)
+    answer = failuretwin("emulate", "--to", path, "--seconds", 38, *FAULT)
     assert answer.returncode == 0, answer.stderr
     states = [text for _, text in told(answer)]
     assert states == ["healthy", "motor_3:stuck", "healthy"]
@@ -51,8 +51,8 @@ def check_found(changes):
     """Check that motor 3 is found stuck after it began, and healthy after it was repaired."""
     stuck = [at for at, text in changes if text.startswith("ALARM: motor 3 stuck")]
     assert stuck
-    assert 12.0 < stuck[0] < 25.0
-    assert [text.startswith("CLEARED:") for at, text in changes if at > 25.0][-1]
+    assert 12.0 < stuck[0] < 22.0
+    assert [text.startswith("CLEARED:") for at, text in changes if at > 22.0][-1]
 
 
 def test_an_emulated_robot_is_watched(watched):
@@ -184,7 +184,7 @@ def test_a_recording_is_not_overwritten(failuretwin, tmp_path):
 def test_an_interrupt_ends_the_watch_and_the_recording(recording, tmp_path, how):
     path = tmp_path / "live.mcap"
     command = [sys.executable, "-m", "failuretwin", "watch", recording, "--record", path]
-    shadow = subprocess.Popen([*command, "--speed", "2"], stdout=subprocess.PIPE, text=True)
+    shadow = subprocess.Popen([*command, "--speed", "4"], stdout=subprocess.PIPE, text=True)
     assert "healthy behaviour: armpi_fpv" in shadow.stdout.readline()
     assert "healthy" in shadow.stdout.readline()  # the first answer
     shadow.send_signal(how)

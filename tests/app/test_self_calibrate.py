@@ -26,6 +26,10 @@ ROBOT = Settling(
 )
 
 
+AMONG = ("--hypotheses", ",".join(TRUTHS))
+"""Where what is learned does not depend on what else is offered."""
+
+
 def diagnose(*arguments):
     given = ["diagnose", *(str(argument) for argument in arguments)]
     return CliRunner().invoke(cli, given, catch_exceptions=False, standalone_mode=False)
@@ -66,8 +70,7 @@ def test_runs_are_judged_together_and_the_robot_is_kept(together, runs, armpi, t
     assert [line.removeprefix("self-calibrated: ") for line in told] == list(learned.remarks)
     assert "6 of 6 runs right" in answer.output
     # The file is a calibration like any other, and may be learned from again.
-    names = ",".join(TRUTHS)
-    diagnose(runs, "--self-calibrate", "--calibration", out, "--json", file, "--hypotheses", names)
+    diagnose(runs, "--self-calibrate", "--calibration", out, "--json", file, *AMONG)
     assert {r["protocol"] for r in records(file)} == {"P1"}
 
 
@@ -110,8 +113,7 @@ def test_what_all_runs_say_of_each_is_written_too(request, runs, tmp_path, way):
     assert all(0.0 < r["course_probability"] <= 1.0 for r in told)
     assert [row[header.index("course")] for row in cells] == [r["course"] for r in told]
     assert {r["course"] for r in told} <= {*told[0]["posterior"]}
-    names = ",".join(TRUTHS)
-    diagnose(runs, option, "--independent", "--json", alone, "--hypotheses", names)
+    diagnose(runs, option, "--independent", "--json", alone, *AMONG)
     assert not any("course" in r for r in records(alone))
     assert all(list(r["posterior"]) == TRUTHS for r in records(alone))
 
@@ -125,9 +127,9 @@ def test_runs_of_two_robots_are_noticed_on_the_way(armpi, tmp_path):
     ]
     for name, some in zip(("a.nc", "b.nc"), made, strict=True):
         save_run_set(some.assign_coords(run=[f"{name[0]}{i}" for i in range(6)]), tmp_path / name)
-    one = diagnose(tmp_path / "a.nc", "--track")
+    one = diagnose(tmp_path / "a.nc", "--track", *AMONG)
     assert "two robots" not in one.output
-    both = diagnose(tmp_path / "a.nc", tmp_path / "b.nc", "--track")
+    both = diagnose(tmp_path / "a.nc", tmp_path / "b.nc", "--track", *AMONG)
     assert "the runs seem to be of two robots" in both.output
 
 
@@ -146,14 +148,14 @@ def test_the_calibration_of_another_robot_is_not_replaced(together, runs, armpi,
     one = tmp_path / "one.nc"
     save_run_set(load_run_set(runs).isel(run=[0]), one)
     for begun in (("--calibration", path), ()):
-        assert diagnose(one, "--self-calibrate", *begun, "--out", path).exit_code == 0
+        assert diagnose(one, "--self-calibrate", *begun, "--out", path, *AMONG).exit_code == 0
         name = read_calibration(path, armpi).imperfections.name
         assert name == "armpi_fpv, self-calibrated"
 
 
 def test_without_it_nothing_is_learned(runs, tmp_path):
     file = tmp_path / "out.jsonl"
-    answer = diagnose(runs, "--json", file)
+    answer = diagnose(runs, "--json", file, *AMONG)
     assert "self-calibrated" not in answer.output
     assert "P1" not in {r["protocol"] for r in records(file)}
 

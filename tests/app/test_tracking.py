@@ -14,6 +14,8 @@ from failuretwin.inference.together.life_filter import WINDOW
 from failuretwin.inference.together.wear_limits import WearLimits
 
 RUNS = 32
+AMONG = ("--hypotheses", "healthy,motor_1:stuck,motor_2:steady_state_error")
+"""Where what is learned does not depend on what else is offered."""
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +44,7 @@ def few_learned(failuretwin, few, tmp_path_factory):
     """A folder with a calibration and its history of the few."""
     folder = tmp_path_factory.mktemp("few")
     own = shutil.copy(load_robot("armpi_fpv").imperfections_file, folder / "cal.toml")
-    answer = failuretwin("diagnose", few, "--calibration", own, "--track")
+    answer = failuretwin("diagnose", few, "--calibration", own, "--track", *AMONG)
     assert answer.returncode == 0, answer.stderr
     return folder
 
@@ -64,7 +66,8 @@ def calibration(tmp_path):
 @pytest.fixture
 def track(failuretwin, calibration):
     def run(*arguments):
-        return failuretwin("diagnose", *arguments, "--calibration", calibration, "--track")
+        known = ("--calibration", calibration, "--track")
+        return failuretwin("diagnose", *arguments, *known, *AMONG)
 
     return run
 
@@ -74,8 +77,10 @@ def rows_of(calibration):
     return [json.loads(line) for line in path.read_text().splitlines()][1:]
 
 
-def test_runs_are_tracked_and_the_history_kept(track, calibration, healthy, tmp_path):
-    answer = track(healthy, "--json", tmp_path / "x.jsonl")
+def test_runs_are_tracked_and_the_history_kept(failuretwin, calibration, healthy, tmp_path):
+    """Every class of the paper is offered, each motor's."""
+    told = ("--calibration", calibration, "--track", "--json", tmp_path / "x.jsonl")
+    answer = failuretwin("diagnose", healthy, *told)
     assert answer.returncode == 0, answer.stderr
     line = answer.stdout.splitlines()[-1]
     assert line.startswith("tracked: 32 runs learned, 32 in all; largest changes: bias of motor_")
@@ -212,7 +217,7 @@ def test_a_life_may_begin_cold_and_go_on(failuretwin, healthy, tmp_path):
 
 
 def test_without_a_file_nothing_is_kept(failuretwin, few, listing, tmp_path):
-    answer = failuretwin("diagnose", few, "--track", "--json", "x.jsonl", folder=tmp_path)
+    answer = failuretwin("diagnose", few, "--track", "--json", "x.jsonl", *AMONG, folder=tmp_path)
     assert answer.returncode == 0, answer.stderr
     protocols = [json.loads(t)["protocol"] for t in (tmp_path / "x.jsonl").read_text().splitlines()]
     assert protocols == ["P0", *["P1"] * 5]
@@ -237,5 +242,5 @@ def test_when_results_cannot_be_written_nothing_is_learned(track, calibration, f
 
 def test_without_the_flag_no_history_is_kept(failuretwin, calibration, few, listing, tmp_path):
     before = listing(tmp_path)
-    assert failuretwin("diagnose", few, "--calibration", calibration).returncode == 0
+    assert failuretwin("diagnose", few, "--calibration", calibration, *AMONG).returncode == 0
     assert listing(tmp_path) == before

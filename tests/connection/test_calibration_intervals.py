@@ -153,7 +153,7 @@ def test_sag_on_the_way_is_not_taken_for_delay(armpi, measured_armpi, tool):
         lost_commands=(),
         readings=replace(measured_armpi.readings, whole_counts=False, glitch_rate=()),
     )
-    runs = simulate(Plan(armpi, [HEALTHY], 15, 3, real))
+    runs = simulate(Plan(armpi, [HEALTHY], 8, 3, real))
     found = fit_calibration(runs, armpi, "trial", "made up", use_readings=not tool, thorough=False)
     by_name = {p.name: p for p in found.parameters}
     # As if sag were spread evenly over a ramp, they would be off by up to 2.5, 1.3 ms and 0.3 %.

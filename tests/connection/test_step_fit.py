@@ -52,8 +52,8 @@ def covered(folder, armpi, motors, seed):
 
 
 def test_intervals_cover_the_truth(tmp_path, armpi):
-    inside, learned, _ = covered(tmp_path, armpi, motors=8, seed=1)
-    assert 35 <= inside.sum() <= 39  # of 40; reached: 38
+    inside, learned, _ = covered(tmp_path, armpi, motors=4, seed=1)
+    assert 17 <= inside.sum() <= 20  # of 20
     assert learned[:, 1:].mean() > 0.9
 
 
@@ -66,7 +66,7 @@ def test_intervals_cover_the_truth_at_the_stated_rate(tmp_path, armpi):
 
 def test_known_gains_come_back(tmp_path, armpi):
     truth = (0.02, 18.0, 0.0115, 4.3, 0.01)
-    found = fit_file(tmp_path, armpi, np.random.default_rng(3), truth, SIZES * 3)
+    found = fit_file(tmp_path, armpi, np.random.default_rng(3), truth, SIZES * 2)
     values = [found[name].value for name in NAMES]
     assert values[1:4] == pytest.approx(truth[1:4], rel=0.1)
     assert values[0] == pytest.approx(truth[0], abs=0.1)

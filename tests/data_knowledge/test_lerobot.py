@@ -121,7 +121,7 @@ def test_a_unit_that_nothing_states_is_guessed_by_size_and_said(tmp_path, scale,
 def test_the_guessed_map_leads_to_a_verdict(tmp_path):
     write_v3(tmp_path / "pick", scale=4.0, clip=100.0)
     command = [sys.executable, "-m", "failuretwin", "diagnose", "pick", "--robot", "so101"]
-    command += ["--columns", "map.toml"]
+    command += ["--columns", "map.toml", "--hypotheses", "healthy,motor_2:stuck"]
 
     def run():
         return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)

@@ -9,7 +9,8 @@ import pytest
 from scipy import stats
 from slide_runs import PLAIN, TARGETS
 
-from failuretwin import Hypothesis, Plan, calibrate, simulate
+from failuretwin import Hypothesis, Plan, simulate
+from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections
 from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -54,7 +55,8 @@ def test_a_held_motor_lies_about_its_angle_by_what_it_gives(twin, run_of, off):
 
 def test_a_calibration_doubts_what_changes_from_day_to_day(armpi):
     """A milliradian of a hobby servo, beside what the logs leave open."""
-    found = calibrate(simulate(Plan(armpi, [Hypothesis()], 6, 2, "armpi_fpv")), armpi)
+    runs = simulate(Plan(armpi, [Hypothesis()], 6, 2, "armpi_fpv"))
+    found = fit_calibration(runs, armpi, "trial", "made up", thorough=False)
     of_logs = [(p.high - p.low) / 2.0 / 1.96 for p in found.parameters if p.name == "bias"]
     told = np.square(found.imperfections.variation.bias) - np.square(of_logs)
     np.testing.assert_allclose(told, 0.001**2, rtol=0.1)

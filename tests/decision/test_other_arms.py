@@ -46,8 +46,15 @@ def accuracy(diagnoses):
     return np.mean([d.diagnosis == d.truth for d in diagnoses])
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["armpi_fpv", "ur5e", "panda", "so101"])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("armpi_fpv", "generic"),
+        *(("ur5e", kind) for kind in ("none", "own")),
+        *(("panda", kind) for kind in ("generic", "own")),
+        *(("so101", kind) for kind in ("none", "own")),
+    ],
+)
 def test_bundled_arms_are_diagnosed(name, kind):
     """Of four to six motors, calibrated or not, ideal or not: mostly right.
 
@@ -62,8 +69,8 @@ def test_bundled_arms_are_diagnosed(name, kind):
     assert accuracy(found) >= (0.7 if kind == "generic" else 0.8)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("kind", ["none", "own"])
+@pytest.mark.parametrize("count", [1, 5])
 def test_any_mode_can_be_weighed_in_short_runs(armpi, twin, kind, count):
     """All hypotheses, `unknown` too; of a single movement hardly any can be told from others."""
     imperfections = KINDS[kind](armpi)
@@ -80,7 +87,7 @@ def test_runs_of_forty_movements_are_diagnosed(armpi, twin):
     known = load_calibration(None, armpi).imperfections
     faults = paper_hypotheses(armpi.motor_names)[::4]
     runs = simulate(Plan(armpi, faults, 1, 3, known, RandomMovements(count=40)))
-    found = BayesDiagnoser(twin, known).diagnose(runs)
+    found = BayesDiagnoser(twin, known, paper_hypotheses(armpi.motor_names)[::2]).diagnose(runs)
     check(found)
     assert [d.diagnosis for d in found] == [d.truth for d in found]
     assert all(d.posterior[d.truth] > (0.85 if d.truth == "healthy" else 0.999) for d in found)

@@ -28,8 +28,12 @@ def quiet(imperfections):
     return dataclasses.replace(deterministic(imperfections), settling=imperfections.settling)
 
 
-def test_the_truth_is_nearest_to_itself(twin, imperfect):
-    found = expected_log_bayes_factors(twin, imperfect)
+@pytest.fixture(scope="module")
+def found(twin, imperfect):
+    return expected_log_bayes_factors(twin, imperfect)
+
+
+def test_the_truth_is_nearest_to_itself(found):
     own = [found.hypotheses.index(truth) for truth in found.truth]
     np.testing.assert_array_equal(found.nats[np.arange(180), own], 0.0)
     others = found.nats.copy()
@@ -37,17 +41,16 @@ def test_the_truth_is_nearest_to_itself(twin, imperfect):
     np.testing.assert_array_equal(found.nearest, others.min(axis=1))
 
 
-def test_runs_that_are_far_ahead_are_diagnosed_right(twin, imperfect, diagnoses):
-    ahead = expected_log_bayes_factors(twin, imperfect).nearest >= 5.0
+def test_runs_that_are_far_ahead_are_diagnosed_right(found, diagnoses):
+    ahead = found.nearest >= 5.0
     right = np.array([d.truth == d.diagnosis for d in diagnoses])
     assert ahead.sum() >= 130
     assert right[ahead].mean() >= 0.97
     assert right[~ahead].mean() <= right[ahead].mean() - 0.05
 
 
-def test_a_run_is_separated_alone(twin, imperfect):
-    some = imperfect.isel(run=[3, 50, 130])
-    whole = expected_log_bayes_factors(twin, imperfect).nats[[3, 50, 130]]
+def test_a_run_is_separated_alone(twin, imperfect, found):
+    some, whole = imperfect.isel(run=[3, 50, 130]), found.nats[[3, 50, 130]]
     np.testing.assert_allclose(
         expected_log_bayes_factors(twin, some).nats, whole, rtol=1e-9, atol=1e-9
     )

@@ -249,7 +249,7 @@ def test_a_zero_far_off_what_such_robots_do_is_told_of_one_run(twin, armpi, know
 
 
 @pytest.mark.parametrize("motor", [0, 1, 2, 3])
-@pytest.mark.parametrize("off_deg", [3.0, -5.0, 10.0])
+@pytest.mark.parametrize("off_deg", [3.0, -10.0])
 def test_of_one_run_a_zero_is_never_surely_a_motor(armpi, known, motor, off_deg):
     """A fault of every movement and a zero show the same: the prior alone tells them apart."""
     run = simulate(Plan(armpi, ["healthy"], 1, 11 + motor, known, RandomMovements(count=5)))

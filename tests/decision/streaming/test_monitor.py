@@ -40,7 +40,8 @@ def test_a_fault_is_one_episode_from_its_alarm_to_its_repair(watcher, work):
 def test_a_larger_budget_alarms_no_later(twin, work):
     samples, raised = work(12, stuck=[(1, 6, 12)]), []
     for budget in (0.01, 100.0):
-        told = answers(monitor(twin, "none", budget), samples)
+        watch = monitor(twin, "none", budget)
+        told = (watch.update(*sample) for sample in samples)
         raised.append(next(a.time for a in told if a.alarm.state == RAISED))
     assert raised == sorted(raised, reverse=True)
     with pytest.raises(InputError, match="false alarms"):

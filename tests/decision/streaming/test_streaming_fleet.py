@@ -48,12 +48,26 @@ def play(runs, diagnoser, robots=slice(None), order=None, skip=()):
     return fleet
 
 
-def test_the_end_of_a_stream_is_the_batch(live_runs, live_diagnoser):
-    fleet = play(live_runs, live_diagnoser)
+@pytest.fixture(scope="module")
+def nine_runs(live_runs):
+    """One of each state."""
+    return live_runs.isel(run=slice(None, None, 2))
+
+
+@pytest.fixture(scope="module")
+def played(nine_runs, live_diagnoser):
+    """A fleet that has seen them to their end, and its posteriors before it was told of that."""
+    fleet = play(nine_runs, live_diagnoser)
+    before = fleet.posterior.copy()
     fleet.conclude()
-    expected = decided(live_diagnoser, live_runs)
-    np.testing.assert_allclose(fleet.posterior, expected, rtol=0.0, atol=1e-9)
-    for robot, diagnosis in enumerate(batch(live_diagnoser).diagnose(live_runs)):
+    return fleet, before
+
+
+def test_the_end_of_a_stream_is_the_batch(nine_runs, live_diagnoser, played):
+    fleet, _ = played
+    expected = batch(live_diagnoser).diagnose(nine_runs)
+    np.testing.assert_allclose(fleet.posterior, posteriors(expected), rtol=0.0, atol=1e-9)
+    for robot, diagnosis in enumerate(expected):
         said = fleet.diagnosis(robot)
         assert said.diagnosis == diagnosis.diagnosis
         assert said.onset_s == pytest.approx(diagnosis.onset_s, abs=0.2)
@@ -64,10 +78,10 @@ def test_the_end_of_a_stream_is_the_batch(live_runs, live_diagnoser):
         assert state_of(said.posterior) == state_of(diagnosis.posterior)
 
 
-def test_robots_do_not_know_each_other(live_runs, live_diagnoser):
-    together = play(live_runs, live_diagnoser).posterior
-    for robot in (0, 5, 11):
-        alone = play(live_runs, live_diagnoser, slice(robot, robot + 1)).posterior
+def test_robots_do_not_know_each_other(nine_runs, live_diagnoser, played):
+    _, together = played
+    for robot in (0, 2, 5):
+        alone = play(nine_runs, live_diagnoser, slice(robot, robot + 1)).posterior
         np.testing.assert_allclose(alone[0], together[robot], rtol=0.0, atol=1e-12)
 
 
@@ -82,11 +96,10 @@ def test_modes_that_show_on_the_way_count_in_streams(live_runs, twin):
     np.testing.assert_allclose(fleet.posterior, expected, rtol=0.0, atol=1e-9)
 
 
-def test_samples_may_come_late(live_runs, live_diagnoser, rng):
+def test_samples_may_come_late(nine_runs, live_diagnoser, rng):
     """Readings that arrive up to 0.1 s late, out of order, change nothing in the end."""
-    count = live_runs.sizes["time"]
+    count, some = nine_runs.sizes["time"], nine_runs
     order = np.argsort(np.arange(count) + rng.integers(0, 10, count), kind="stable")
-    some = live_runs.isel(run=slice(0, 9))
     settled = BayesDiagnoser(live_diagnoser.twin, whole_run=False)
     # What is told late of commands is not taken up, so only readings are late here.
     time, command = some["time"].values, some["command"].values
@@ -99,9 +112,9 @@ def test_samples_may_come_late(live_runs, live_diagnoser, rng):
     np.testing.assert_allclose(fleet.posterior, decided(settled, some), rtol=0.0, atol=1e-9)
 
 
-def test_missing_samples_are_no_evidence(live_runs, live_diagnoser, rng):
+def test_missing_samples_are_no_evidence(nine_runs, live_diagnoser, rng):
     """Readings that are lost on the way to the stream might as well not have been taken."""
-    some = live_runs.isel(run=slice(0, 9)).copy(deep=True)
+    some = nine_runs.copy(deep=True)
     lost = rng.random(some["measured"].shape[:2]) < 0.3
     some["measured"].values[lost] = np.nan
     fleet = play(some, live_diagnoser)
@@ -110,15 +123,14 @@ def test_missing_samples_are_no_evidence(live_runs, live_diagnoser, rng):
     np.testing.assert_allclose(fleet.posterior, expected, rtol=0.0, atol=1e-9)
 
 
-def test_whole_samples_may_be_missing(live_runs, live_diagnoser, rng):
+def test_whole_samples_may_be_missing(nine_runs, live_diagnoser, played, rng):
     """Commands are known as well from fewer samples: their corners are found between them."""
-    whole = play(live_runs, live_diagnoser)
-    kept = rng.random(live_runs.sizes["time"]) < 0.8
-    read = np.isfinite(live_runs["measured"].values).all(axis=2).any(axis=0)
+    whole, _ = played
+    kept = rng.random(nine_runs.sizes["time"]) < 0.8
+    read = np.isfinite(nine_runs["measured"].values).all(axis=2).any(axis=0)
     kept[:30] = True
-    fewer = play(live_runs, live_diagnoser, skip=set(np.flatnonzero(~kept & ~read).tolist()))
-    for fleet in (whole, fewer):
-        fleet.conclude()
+    fewer = play(nine_runs, live_diagnoser, skip=set(np.flatnonzero(~kept & ~read).tolist()))
+    fewer.conclude()
     np.testing.assert_allclose(fewer.posterior, whole.posterior, atol=0.02)
 
 
