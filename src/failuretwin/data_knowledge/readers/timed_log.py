@@ -53,11 +53,14 @@ class Targets:
         time: When each was sent, (command,) [s].
         target: (command, motor) [rad].
         duration: (command, motor) [s].
+        initial: Where the first ramp starts, (motor,) [rad]; None: at the last reading before it,
+            or where there is none at the first target, so that no ramp is seen.
     """
 
     time: FloatArray
     target: FloatArray
     duration: FloatArray
+    initial: FloatArray | None = None
 
 
 def held(target: FloatArray) -> FloatArray:
@@ -111,21 +114,30 @@ def timed_run(log: TimedLog, robot: Robot) -> RunTable:
     step = _grid_step(stamps, tool)
     check_grid((end - begin) / step, len(stamps), log.name)
     time = as_floats(np.arange(round((end - begin) / step) + 1) * step)
+    return gridded(log, tool, robot, time, begin, tool.rate_hz)
+
+
+def gridded(
+    log: TimedLog, tool: Samples, robot: Robot, time: FloatArray, begin: float, rate_hz: float
+) -> RunTable:
+    """Return a log as a run on the grid `time` (time,), which counts from `begin` [s]."""
+
+    def placed(samples: Samples) -> FloatArray:
+        return on_grid(samples, time, begin)[None]
+
     command, movements = _command(log, time, begin)
     return RunTable(
         run=[log.name],
         motor=robot.motor_names,
         time=time,
         command=command[None],
-        measured=on_grid(tool, time, begin)[None],
-        measured_rate_hz=tool.rate_hz,
+        measured=placed(tool),
+        measured_rate_hz=rate_hz,
         movements=movements,
-        position=None if log.position is None else on_grid(log.position, time, begin)[None],
+        position=None if log.position is None else placed(log.position),
         sensors={
-            name: on_grid(samples, time, begin).reshape(
-                1, len(time), *SHAPES.get(name, samples.value.shape[1:])
-            )
-            for name, samples in log.sensors.items()
+            name: placed(one).reshape(1, len(time), *SHAPES.get(name, one.value.shape[1:]))
+            for name, one in log.sensors.items()
         },
     )
 
@@ -251,16 +263,14 @@ def _command(log: TimedLog, time: FloatArray, begin: float) -> tuple[FloatArray,
 
 
 def _initial(log: TimedLog, command: Targets) -> FloatArray:
-    """Return where the first ramp starts, (motor,) [rad]: the last reading before it, if any.
-
-    Otherwise the first target, so that no ramp is seen.
-    """
+    """Return where the first ramp starts, (motor,) [rad]; see `Targets`."""
+    if command.initial is not None:
+        return command.initial
     if log.position is not None:
-        before = (log.position.time <= command.time[0]) & np.isfinite(log.position.value).all(
-            axis=1
-        )
-        if before.any():
-            return log.position.value[np.flatnonzero(before)[-1]]
+        whole = np.isfinite(log.position.value).all(axis=1)
+        before = np.flatnonzero((log.position.time <= command.time[0]) & whole)
+        if len(before):
+            return log.position.value[before[-1]]
     return command.target[0]
 
 
