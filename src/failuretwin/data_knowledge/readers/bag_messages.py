@@ -300,9 +300,10 @@ def _joined(parts: Sequence[Rows], where: str, first: Sequence[str], *, in_count
     every = np.concatenate([np.empty(0, dtype=np.int64), *(part.stamp_ns for part in parts)])
     stamps, place = np.unique(every, return_inverse=True)
     value, duration = np.full((2, len(stamps), len(names)), np.nan)
-    ends = np.cumsum([len(part.stamp_ns) for part in parts])
-    for part, at in zip(parts, np.split(place, ends[:-1]), strict=bool(parts)):
-        cells = np.ix_(at, [column[name] for name in part.names])
+    starts = np.cumsum([0, *(len(part.stamp_ns) for part in parts)])
+    for part, start, end in zip(parts, starts[:-1], starts[1:], strict=True):
+        columns = np.array([column[name] for name in part.names], dtype=np.int64)
+        cells = np.ix_(place[start:end], columns)
         value[cells] = part.value
         duration[cells] = np.nan if part.duration is None else part.duration
     timed = any(part.duration is not None for part in parts)
