@@ -15,16 +15,15 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import STEP_S, RunTable, Truth, concatenate
-from failuretwin.core.types import MS_PER_S, FloatArray, as_floats
+from failuretwin.core.types import MS_PER_S, FloatArray
 from failuretwin.data_knowledge.readers.table import Table
 from failuretwin.data_knowledge.readers.timed_log import (
     Samples,
     Targets,
     TimedLog,
-    check_clock,
-    check_grid,
     gridded,
     path_of_readings,
+    uniform_grid,
 )
 from failuretwin.digital_model.robot import Robot
 
@@ -266,14 +265,13 @@ def _measured_window(session: RawSession, robot: Robot, span: range) -> _Window:
     end = float(np.append(session.command_time, np.inf)[span.stop])
     end = min(end, float(stamps[-1]))
     both = np.concatenate([session.command_time[span.start : span.stop], stamps])
-    check_clock(both[(both >= begin) & (both <= end)], str(session.folder))
-    check_grid((end - begin) / STEP_S, len(both), str(session.folder))
+    inside = both[(both >= begin) & (both <= end)]
+    time = uniform_grid(inside, end - begin, STEP_S, str(session.folder))
     # A reading before a gap stalled: it was taken at some time within the gap.
     stalled = np.append(np.diff(stamps) > GAP_S, False)
     kept = (stamps >= begin) & (stamps <= end) & ~stalled
     counts = session.reading_counts[kept]
     counts = np.where(robot.servo_units.valid(counts), counts, np.nan)
-    time = as_floats(np.arange(round((end - begin) / STEP_S) + 1) * STEP_S)
     return begin, time, Samples(stamps[kept] - begin, counts)
 
 

@@ -109,11 +109,8 @@ def timed_run(log: TimedLog, robot: Robot) -> RunTable:
     tool = _tool_path(log, robot)
     _check_commands(log)
     stamps = np.unique(np.concatenate([log.command.time, tool.time]))
-    check_clock(stamps, log.name)
     begin, end = stamps[0], max(tool.time[-1], stamps[0] + STEP_S)
-    step = _grid_step(stamps, tool)
-    check_grid((end - begin) / step, len(stamps), log.name)
-    time = as_floats(np.arange(round((end - begin) / step) + 1) * step)
+    time = uniform_grid(stamps, end - begin, _grid_step(stamps, tool), log.name)
     return gridded(log, tool, robot, time, begin, tool.rate_hz)
 
 
@@ -220,32 +217,34 @@ def _check_times(time: FloatArray, name: str) -> None:
         )
 
 
-def check_clock(time: FloatArray, where: str) -> None:
-    """Raise InputError if `time` [s], in any order, holds a silence that no log can mean."""
-    time = np.sort(time)
-    steps = np.diff(time)
+def uniform_grid(stamps: FloatArray, length: float, step: float, where: str) -> FloatArray:
+    """Return the time grid of a run, (time,) [s].
+
+    Args:
+        stamps: Times of its commands and readings, in any order [s].
+        length: Its end [s].
+        step: Step of the grid [s].
+        where: Its name, for the error text.
+
+    Raises:
+        InputError: If the stamps hold a silence that no log can mean, or the grid has far more
+            samples than there are stamps.
+    """
+    stamps = np.sort(stamps)
+    steps = np.diff(stamps)
     if len(steps) and steps.max() > LONGEST_SILENCE_S:
-        before = float(time[int(np.argmax(steps))] - time[0])
+        before = float(stamps[int(np.argmax(steps))] - stamps[0])
         raise InputError(
             f"{where}: the clock jumps by {steps.max():.0f} s, {before:.1f} s after the start. "
             "Cut the log there."
         )
-
-
-def check_grid(samples: float, stamps: int, where: str) -> None:
-    """Raise InputError if a time grid has far more samples than there are stamps in a log.
-
-    Args:
-        samples: Samples of the grid.
-        stamps: Commands and readings of the log.
-        where: Its name, for the error text.
-    """
-    if samples > max(SAMPLES_ALWAYS, SAMPLES_PER_STAMP * stamps):
+    if length / step > max(SAMPLES_ALWAYS, SAMPLES_PER_STAMP * len(stamps)):
         raise InputError(
-            f"{where}: its {stamps} commands and readings lie {samples:.2g} steps of the time grid "
-            f"apart, expected {SAMPLES_PER_STAMP} steps each at most. Check the unit of its times: "
-            "milliseconds may have been taken for seconds."
+            f"{where}: its {len(stamps)} commands and readings lie {length / step:.2g} steps of "
+            f"the time grid apart, expected {SAMPLES_PER_STAMP} steps each at most. Check the unit "
+            "of its times: milliseconds may have been taken for seconds."
         )
+    return as_floats(np.arange(round(length / step) + 1) * step)
 
 
 def _command(log: TimedLog, time: FloatArray, begin: float) -> tuple[FloatArray, Movements | None]:
