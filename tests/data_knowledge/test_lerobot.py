@@ -176,6 +176,20 @@ def test_a_data_set_without_data_says_so(tmp_path):
         read_runs(tmp_path, "so101")
 
 
+def test_a_frame_without_the_number_of_its_episode_is_refused(tmp_path):
+    import pyarrow.parquet as pq
+
+    folder = write_v3(tmp_path / "pick")
+    (file,) = (folder / "data").rglob("*.parquet")
+    table = pq.read_table(file)
+    place = table.schema.get_field_index("episode_index")
+    numbers = [None, *table["episode_index"].to_pylist()[1:]]
+    pq.write_table(table.set_column(place, "episode_index", [numbers]), file)
+
+    with pytest.raises(InputError, match="episode_index and frame_index have rows without"):
+        read_runs(folder, "so101")
+
+
 @pytest.fixture(scope="module")
 def teleoperated(data):
     """Four episodes of a healthy arm, normalised: its elbow is clipped at exactly 100."""

@@ -64,8 +64,6 @@ def fit(
     twin: DigitalTwin,
     free: BoolArray,
     steps: int,
-    limits: tuple[FloatArray, FloatArray] | None = None,
-    least_gain: float = 0.0,
     one_is_enough: bool = False,
 ) -> Movements:
     """Return a least-squares fit near each guess; undetermined parameters stay near the guess.
@@ -79,34 +77,27 @@ def fit(
         twin: Kinematics.
         free: Free poses and durations, ((1 + 2 M) motor,); starts are always free.
         steps: Maximum number of steps.
-        limits: Lowest and highest parameters, (parameter,); None: unlimited.
-        least_gain: Smallest relative decrease of the squared error for another step.
         one_is_enough: Stop when one guess has become exact.
     """
     x, damping = _parameters(guess), np.full(len(guess.start), DAMPING)
-    low, high = limits or (-np.inf, np.inf)
     _, count, motors = guess.target.shape
     durations = slice((1 + count) * motors, (1 + 2 * count) * motors)
     columns = np.append(free, np.full(guess.start.shape[1], True))
     error, J = _error_and_jacobian(x, guess, columns, part, twin)
     cost = np.sum(error**2, axis=1)
+    longest = part.time[-1] - part.time[0]
     enough = error.shape[1] / 3.0 * CONVERGED_M**2
-    settled = np.zeros(len(x), dtype=np.bool_)
     for _ in range(steps):
         exact = cost <= enough
-        if np.all(settled | exact | (damping >= MOST_DAMPING) & (least_gain > 0.0)):
-            break
-        if one_is_enough and exact.any():
+        if np.all(exact | (damping >= MOST_DAMPING)) or (one_is_enough and exact.any()):
             break
         trial = x.copy()
         trial[:, columns] += _step(error, J, damping)
-        trial = np.clip(trial, low, high)
-        # Durations stay positive.
-        trial[:, durations] = np.maximum(trial[:, durations], 0.5 * x[:, durations])
+        # Durations stay positive, and no longer than the path.
+        trial[:, durations] = np.clip(trial[:, durations], 0.5 * x[:, durations], longest)
         trial_error, trial_jacobian = _error_and_jacobian(trial, guess, columns, part, twin)
         trial_cost = np.sum(trial_error**2, axis=1)
         better = trial_cost < cost
-        settled = better & (cost - trial_cost < least_gain * cost)
         x = np.where(better[:, None], trial, x)
         error = np.where(better[:, None], trial_error, error)
         J = np.where(better[:, None, None], trial_jacobian, J)

@@ -19,7 +19,7 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements, stack_movements
 from failuretwin.core.runs import STEP_S
-from failuretwin.core.types import FloatArray, as_floats, frozen_array
+from failuretwin.core.types import FloatArray, IntArray, as_floats, frozen_array
 from failuretwin.data_knowledge.ramp_fit import PathPart, fit, path_error, single_movements
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 from failuretwin.digital_model.robot import Robot
@@ -46,22 +46,14 @@ MOST_MOTORS = 4
 """Motors whose pose follows from a tool position and the count of the last one."""
 WHOLE_STARTS = 16
 """First guesses of a pose for every count of the last motor."""
-OUTSIDE_FACTOR = 10.0
-"""Cost of an angle outside the range of random movements, relative to that of travel."""
 REACHED_M = 1e-3
 """A pose this much worse than the best one [m] does not reach its point."""
 DURATION_SHARES = (0.6, 1.0)
 """Range of guessed durations, as shares of the time in which the tool moves."""
-LEAST_DURATION_S = 0.02
-"""Shortest ramp in a fit [s]."""
 FIT_SAMPLES, REST_SAMPLES = 24, 5
 """Samples for the fit of a ramp, and samples at rest on both sides of it."""
 RAMP_STEPS, START_STEPS, RUN_STEPS = 60, 8, 100
 """Maximum number of steps of the fits of a ramp, its start and a run."""
-LEAST_GAIN = 1e-5
-"""Smallest relative decrease of the squared error in the fit of a run."""
-START_SHIFT_S = 0.15
-"""Largest change of a start in the fit of a run [s]."""
 SEEDS = (0, 1, 2)
 """Seeds of the guesses for a run, each tried until the fit is as good as the path's noise."""
 EQUAL_SHARE = 0.1
@@ -298,7 +290,7 @@ class _Run:
         poses = poses[np.linalg.norm(self.twin.path(poses) - point, axis=1) <= 2.0 * EXACT_M]
         if not len(poses):
             raise _NoWholeUnitsError("no pose in whole servo units puts the tool where it rests")
-        return poses[np.argsort(self._cost(poses, zero), kind="stable")]
+        return poses[_nearest_first(poses, zero)]
 
     def _whole_ramps(self, m: int, origins: FloatArray | None) -> Movements:
         """Return the ramps between whole counts that make movement `m`.
@@ -362,7 +354,7 @@ class _Run:
         fixed = np.zeros(3 * len(speed), dtype=np.bool_)
         found = fit(guesses, part, self.twin, fixed, START_STEPS)
         found = found[path_error(found, part, self.twin).max(axis=1) <= EXACT_M]
-        return found[np.argsort(self._cost(found.target[:, 0], ramp.target[0, 0]), kind="stable")]
+        return found[_nearest_first(found.target[:, 0], ramp.target[0, 0])]
 
     @cached_property
     def _whole_limits(self) -> FloatArray:
@@ -376,7 +368,7 @@ class _Run:
     def nearest(self) -> Movements:
         if not self.spans:
             poses = self._poses(self.rests[0], GUESSES[0])
-            return self._joined(poses[[np.argmin(self._cost(poses, self._zero))]], [])
+            return self._joined(poses[_nearest_first(poses, self._zero)][:1], [])
         return self._together(self._chain(self._nearest_ramps))
 
     def _nearest_ramps(self, m: int, origins: FloatArray | None) -> Movements:
@@ -388,22 +380,14 @@ class _Run:
                 break
         fitted = fitted[rms <= rms.min() * (1.0 + EQUAL_SHARE) + NO_NOISE_M]
         origin, target = fitted.initial, fitted.target[:, 0]
-        cost = self._cost(target, origin) + np.linalg.norm(origin, axis=1)
-        return fitted[np.argsort(cost, kind="stable")]
+        travel = np.linalg.norm(target - origin, axis=1) + np.linalg.norm(origin, axis=1)
+        return fitted[np.argsort(travel, kind="stable")]
 
     def _together(self, guess: Movements) -> Movements:
         """Return all movements of the run fitted at once."""
         count, motors = guess.target.shape[1:]
-        begun = np.maximum.accumulate(guess.start[0])
-        longest = np.diff(begun, append=np.inf).clip(2.0 * LEAST_DURATION_S)
-        low = [np.tile(self.kinematics.low, count + 1), np.full(count * motors, LEAST_DURATION_S)]
-        high = [np.tile(self.kinematics.high, count + 1), np.repeat(longest, motors)]
-        limits = (
-            np.concatenate([*low, begun - START_SHIFT_S]),
-            np.concatenate([*high, begun + START_SHIFT_S]),
-        )
         free = np.full((1 + 2 * count) * motors, True)
-        fitted = fit(guess, self.path, self.twin, free, RUN_STEPS, limits, LEAST_GAIN)
+        fitted = fit(guess, self.path, self.twin, free, RUN_STEPS)
         return _without_idle_ramps(fitted)
 
     # Both.
@@ -426,11 +410,6 @@ class _Run:
             chain.insert(0, found.pop()[leads][:1])
         return self._joined(chain[0].initial, chain)
 
-    @cached_property
-    def _usual(self) -> FloatArray:
-        """Lowest and highest angles of random movements, (2, motor) [rad]."""
-        return np.array([motor.movement_range for motor in self.twin.robot.motors]).T
-
     @property
     def _zero(self) -> FloatArray:
         return np.zeros(len(self.twin.robot.motors))
@@ -448,16 +427,10 @@ class _Run:
 
     def _poses(self, point: FloatArray, count: int) -> FloatArray:
         """Return poses all over the arm's range at a point, (pose, motor) [rad]."""
-        low, high = self._usual
-        drawn = self.rng.uniform(low, high, (4 * count, len(low)))
-        found = self.kinematics.solve(point[None], np.concatenate([self._zero[None], drawn]))
+        low, high = np.transpose([motor.movement_range for motor in self.twin.robot.motors])
+        starts = self.rng.uniform(low, high, (4 * count, len(low)))
+        found = self.kinematics.solve(point[None], np.concatenate([self._zero[None], starts]))
         return found.pose[0][found.miss_m[0] <= found.miss_m.min() + REACHED_M]
-
-    def _cost(self, poses: FloatArray, near: FloatArray) -> FloatArray:
-        """Return travel to poses (pose, motor), and more outside the usual range, (pose,) [rad]."""
-        low, high = self._usual
-        outside = np.maximum(low - poses, poses - high).clip(0.0).sum(axis=1)
-        return np.linalg.norm(poses - near, axis=1) + OUTSIDE_FACTOR * outside
 
     def _fitted(
         self, m: int, origins: FloatArray | None, targets: FloatArray | None, count: int
@@ -478,13 +451,8 @@ class _Run:
         duration = self.rng.uniform(*DURATION_SHARES, origin.shape) * (last - first)
         step = self.path.time[1] - self.path.time[0]
         guesses = single_movements(origin, target, duration, first + 0.5 * step)
-        motors = origin.shape[1]
-        least = np.repeat([-np.inf, 0.0, -np.inf], [2 * motors, motors, 1])
-        most = np.repeat([np.inf, last - first, np.inf], [2 * motors, motors, 1])
-        free = np.repeat([origins is None, targets is None, True], motors)
-        return fit(
-            guesses, self._part(m), self.twin, free, RAMP_STEPS, (least, most), one_is_enough=True
-        )
+        free = np.repeat([origins is None, targets is None, True], origin.shape[1])
+        return fit(guesses, self._part(m), self.twin, free, RAMP_STEPS, one_is_enough=True)
 
     def _joined(self, initial: FloatArray, ramps: Sequence[Movements]) -> Movements:
         """Return one run from the pose `initial` (1, motor) with the movements of all ramps."""
@@ -495,6 +463,11 @@ class _Run:
             for name in ("target", "ramp_duration", "start")
         )
         return _without_idle_ramps(Movements(initial, target, duration, start))
+
+
+def _nearest_first(poses: FloatArray, to: FloatArray) -> IntArray:
+    """Return the order of poses (pose, motor) by their distance from a pose."""
+    return np.argsort(np.linalg.norm(poses - to, axis=1), kind="stable")
 
 
 def _without_idle_ramps(movements: Movements) -> Movements:

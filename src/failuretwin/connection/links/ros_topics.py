@@ -9,7 +9,6 @@ from pathlib import Path
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.readers.bag_messages import (
-    MONITORING,
     ROLES,
     Kind,
     Role,
@@ -78,7 +77,7 @@ class RosTopics:
                     "and /, such as /arm_controller/command."
                 )
             kind = kind_of_type(type_)
-            foreign = kind is MONITORING and type_.split("/")[0] in STANDARD_PACKAGES
+            foreign = kind is Kind.MONITORING and type_.split("/")[0] in STANDARD_PACKAGES
             check_role(role, None if foreign else kind, f"{role}_type is {type_!r}, which")
 
     @property

@@ -9,7 +9,7 @@ later. Where the stamp is zero, the time at which the message was received stand
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Literal, get_args
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import AXES
-from failuretwin.core.types import MS_PER_S, FloatArray, IntArray, as_floats
+from failuretwin.core.types import MS_PER_S, BoolArray, FloatArray, IntArray, as_floats
 
 NS_PER_S = 1_000_000_000
 HEADER = {"header": "std_msgs/msg/Header"}
@@ -46,32 +46,18 @@ KINDS: dict[Role, tuple[Kind, ...]] = {
     "goal": (Kind.MONITORING, Kind.JOINT_STATE),
 }
 """Kinds of messages that can play each role."""
+NAMED = HEADER | {"name": "string[]", "position": "float[]"}
 FIELDS: dict[Kind, dict[str, str]] = {
-    Kind.MONITORING: {
-        "name": "string[]",
-        "position": "float[]",
-        "temperature": "float[]",
-        "voltage": "float[]",
-    },
-    Kind.JOINT_STATE: {
-        "name": "string[]",
-        "position": "float[]",
-        "velocity": "float[]",
-        "effort": "float[]",
-    },
-    Kind.TRAJECTORY: {
-        "joint_names": "string[]",
-        "points": "trajectory_msgs/msg/JointTrajectoryPoint[]",
-    },
-    Kind.POINT: {"point": "geometry_msgs/msg/Point"},
-    Kind.POSE: {"pose": "geometry_msgs/msg/Pose"},
+    Kind.MONITORING: NAMED | {"temperature": "float[]", "voltage": "float[]"},
+    Kind.JOINT_STATE: NAMED | {"velocity": "float[]", "effort": "float[]"},
+    Kind.TRAJECTORY: HEADER
+    | {"joint_names": "string[]", "points": "trajectory_msgs/msg/JointTrajectoryPoint[]"},
+    Kind.POINT: HEADER | {"point": "geometry_msgs/msg/Point"},
+    Kind.POSE: HEADER | {"pose": "geometry_msgs/msg/Pose"},
 }
-"""Fields beside the header that each kind is known by; all kinds but the first have no others."""
-MONITORING = Kind.MONITORING
-STANDARD_TYPES = {kind.value.replace("/msg/", "/"): kind for kind in Kind if kind is not MONITORING}
+"""Fields that each kind is known by; all kinds but the first have no others."""
+STANDARD_TYPES = {kind.value.replace("/msg/", "/"): kind for kind in Kind}
 """Kinds of the standard types by their ROS 1 names."""
-
-
 GOAL_TOPIC = "/joint_goals"
 """Topic of the goals that motors report, in our recordings."""
 
@@ -96,16 +82,15 @@ class BagTopics:
 
 def kind_of(fields: Mapping[str, str]) -> Kind | None:
     """Return the kind of a message with these fields, None if it is none that is understood."""
-    for kind, own in FIELDS.items():
-        wanted = HEADER | own
-        if dict(fields) == wanted or (kind is Kind.MONITORING and wanted.items() <= fields.items()):
+    for kind, wanted in FIELDS.items():
+        if fields == wanted or (kind is Kind.MONITORING and wanted.items() <= fields.items()):
             return kind
     return None
 
 
 def kind_of_type(type_: str) -> Kind:
     """Return the kind of a message type; one that is not standard has the authors' fields."""
-    return STANDARD_TYPES.get(type_.replace("/msg/", "/"), MONITORING)
+    return STANDARD_TYPES.get(type_.replace("/msg/", "/"), Kind.MONITORING)
 
 
 def check_role(role: Role, kind: Kind | None, what: str) -> None:
@@ -157,11 +142,11 @@ class BagMessage:
 
 @dataclass(frozen=True)
 class Rows:
-    """Values of one topic, sorted by time, no time twice.
+    """Values of one topic, or of one message.
 
     Attributes:
         where: File and topic, for error texts.
-        stamp_ns: (row,) [ns].
+        stamp_ns: (row,) [ns]; increasing.
         value: Joints by name (row, name) [counts or rad], motors (row, motor) [rad], or tool
             positions (row, axis) [m]; NaN where unknown.
         names: Names of the columns.
@@ -176,15 +161,12 @@ class Rows:
     duration: FloatArray | None = None
     in_counts: bool = False
 
-
-@dataclass(frozen=True)
-class _Row:
-    """Values of some joints at one time; `duration` [s] for targets."""
-
-    stamp_ns: int
-    names: Sequence[str]
-    value: FloatArray
-    duration: FloatArray | None = None
+    def take(self, rows: BoolArray | slice) -> Rows:
+        """Return some of the rows."""
+        duration = None if self.duration is None else self.duration[rows]
+        return replace(
+            self, stamp_ns=self.stamp_ns[rows], value=self.value[rows], duration=duration
+        )
 
 
 def topic_rows(messages: Sequence[BagMessage], kind: Kind, role: Role, where: str) -> Rows:
@@ -199,140 +181,130 @@ def topic_rows(messages: Sequence[BagMessage], kind: Kind, role: Role, where: st
     Raises:
         InputError: If names and values do not fit together or a time makes no sense.
     """
-    if kind in KINDS["tool"]:
-        rows = [_tool_row(message, kind) for message in messages]
-        rows = [row for row in rows if np.isfinite(row.value).all()]
-        return _joined(rows, where, AXES)
     if kind is Kind.TRAJECTORY:
-        rows = _trajectory_rows(messages, where)
+        parts = _trajectories(messages, where)
     elif kind is Kind.MONITORING:
-        rows = [_monitoring_row(m, where, command=role == "command") for m in messages]
+        parts = [_servo_row(m, where, command=role == "command") for m in messages]
+    elif kind is Kind.JOINT_STATE:
+        parts = [_state_row(m, where) for m in messages if len(m.content.position)]
     else:
-        rows = [_state_row(m, where) for m in messages if len(m.content.position)]
-    return _joined(rows, where, in_counts=kind is Kind.MONITORING)
+        rows = [_tool_row(m, kind, where) for m in messages]
+        parts = [row for row in rows if np.isfinite(row.value).all()]
+    first = AXES if kind in KINDS["tool"] else ()
+    return _joined(parts, where, first, in_counts=kind is Kind.MONITORING)
 
 
-def _tool_row(message: BagMessage, kind: Kind) -> _Row:
+def _tool_row(message: BagMessage, kind: Kind, where: str) -> Rows:
     content = message.content
     point = content.point if kind is Kind.POINT else content.pose.position
-    return _Row(_stamp_ns(message), AXES, as_floats([point.x, point.y, point.z]))
+    return Rows(where, _stamp(message), as_floats([[point.x, point.y, point.z]]), AXES)
 
 
-def _stamp_ns(message: BagMessage) -> int:
-    return _nanoseconds(message.content.header.stamp) or message.received_ns
+def _stamp(message: BagMessage) -> IntArray:
+    stamp_ns = _nanoseconds(message.content.header.stamp) or message.received_ns
+    return np.array([stamp_ns], dtype=np.int64)
 
 
 def _nanoseconds(time: Any) -> int:
     return int(time.sec) * NS_PER_S + int(time.nanosec)
 
 
-def _state_row(message: BagMessage, where: str) -> _Row:
-    names, value = message.content.name, as_floats(message.content.position)
-    _check_lengths(names, value, "position", where)
-    return _Row(_stamp_ns(message), names, value)
+def _state_row(message: BagMessage, where: str) -> Rows:
+    names = tuple(message.content.name)
+    value = _values(message.content.position, names, "position", where)
+    return Rows(where, _stamp(message), value, names)
 
 
-def _monitoring_row(message: BagMessage, where: str, *, command: bool) -> _Row:
-    content = message.content
-    value = as_floats(content.position)
-    names = _servo_names(content.name, len(value))
-    _check_lengths(names, value, "position", where)
-    if not command:
-        return _Row(_stamp_ns(message), names, value)
-    duration_ms = as_floats(content.temperature)
-    _check_lengths(names, duration_ms, "temperature", where)
-    if not np.all(duration_ms >= 0):
-        raise InputError(
-            f"{where}: the durations of a command (its field `temperature`) are "
-            f"{duration_ms.tolist()} ms, expected 0 or more."
-        )
-    return _Row(_stamp_ns(message), names, value, duration_ms / MS_PER_S)
-
-
-def _servo_names(names: Sequence[str], count: int) -> Sequence[str]:
-    """Return names, or the numbers of the servos where names do not tell which value is whose.
-
-    Of the authors' programs some put one label on all values (``Target value``), some the labels
-    of `AUTHORS_LABELS`; all fill in the values of servos 1, 2, ... in this order.
-    """
-    if len(names) < count or tuple(names) == AUTHORS_LABELS:
-        return [str(servo) for servo in range(1, count + 1)]
-    return names
-
-
-def _trajectory_rows(messages: Sequence[BagMessage], where: str) -> list[_Row]:
-    """Return a target for each point, sent when the point before it was due."""
-    plans = sorted((m for m in messages if len(m.content.points)), key=_stamp_ns)
-    rows: list[_Row] = []
-    for index, plan in enumerate(plans):
-        segments = _segments(plan, where)
-        # A point due at once with others to follow is where the plan starts. That is news only
-        # at the first one; later plans start where those before them went.
-        news = segments[1:] if index and len(segments) > 1 and not _lasts(segments[0]) else segments
-        replaced_ns = _replaced_ns(plans, index)
-        rows += [segment for segment in news if segment.stamp_ns < replaced_ns]
-    return rows
-
-
-def _replaced_ns(plans: Sequence[BagMessage], index: int) -> float:
-    """Return when a later plan takes over a joint of this one [ns], infinity if none does."""
-    joints = set(plans[index].content.joint_names)
-    later = (plans[k] for k in range(index + 1, len(plans)))
-    starts = (_stamp_ns(plan) for plan in later if joints & set(plan.content.joint_names))
-    return next(starts, float("inf"))
-
-
-def _segments(plan: BagMessage, where: str) -> list[_Row]:
-    """Return the points of a plan as targets; one due at once is sent a nanosecond early.
-
-    Two points of a plan so never share a stamp.
-    """
-    names, start_ns = plan.content.joint_names, _stamp_ns(plan)
-    rows: list[_Row] = []
-    before_ns = 0
-    for point in plan.content.points:
-        due_ns = _nanoseconds(point.time_from_start)
-        if due_ns < 0 or (rows and due_ns <= before_ns):
-            raise InputError(
-                f"{where}: a point of a trajectory is due after {due_ns / NS_PER_S:g} s, the one "
-                f"before it after {before_ns / NS_PER_S:g} s. Expected times that increase from 0."
-            )
-        value = as_floats(point.positions)
-        _check_lengths(names, value, "positions", where)
-        duration = np.full(len(value), (due_ns - before_ns) / NS_PER_S)
-        rows.append(_Row(start_ns + before_ns - (due_ns == 0), names, value, duration))
-        before_ns = due_ns
-    return rows
-
-
-def _lasts(row: _Row) -> bool:
-    return row.duration is not None and bool(np.any(row.duration > 0.0))
-
-
-def _check_lengths(names: Sequence[str], values: FloatArray, field: str, where: str) -> None:
+def _values(values: Sequence[float], names: Sequence[str], field: str, where: str) -> FloatArray:
+    """Return the values in a field of a message, (1, name)."""
     if len(names) != len(values):
         raise InputError(
             f"{where}: a message names {len(names)} joints ({', '.join(names)}) but its field "
             f"`{field}` holds {len(values)} values. Expected one for each."
         )
+    return as_floats(values)[None]
 
 
-def _joined(
-    rows: Sequence[_Row], where: str, first: Sequence[str] = (), *, in_counts: bool = False
-) -> Rows:
-    """Return rows as one table; of values with the same stamp, the last received counts.
+def _servo_row(message: BagMessage, where: str, *, command: bool) -> Rows:
+    """Return the values of the authors' message; in a command, temperatures are durations."""
+    content = message.content
+    names = _servo_names(tuple(content.name), len(content.position))
+    value = _values(content.position, names, "position", where)
+    if not command:
+        return Rows(where, _stamp(message), value, names)
+    duration_ms = _values(content.temperature, names, "temperature", where)
+    if not np.all(duration_ms >= 0):
+        raise InputError(
+            f"{where}: the durations of a command (its field `temperature`) are "
+            f"{duration_ms[0].tolist()} ms, expected 0 or more."
+        )
+    return Rows(where, _stamp(message), value, names, duration_ms / MS_PER_S)
+
+
+def _servo_names(names: tuple[str, ...], count: int) -> tuple[str, ...]:
+    """Return names, or the numbers of the servos where names do not tell which value is whose.
+
+    Of the authors' programs some put one label on all values (``Target value``), some the labels
+    of `AUTHORS_LABELS`; all fill in the values of servos 1, 2, ... in this order.
+    """
+    if len(names) < count or names == AUTHORS_LABELS:
+        return tuple(str(servo) for servo in range(1, count + 1))
+    return names
+
+
+def _trajectories(messages: Sequence[BagMessage], where: str) -> list[Rows]:
+    """Return the targets of each trajectory, but for those that a later one replaces."""
+    messages = sorted((m for m in messages if len(m.content.points)), key=_stamp)
+    plans = [_targets(message, where) for message in messages]
+    plans = plans[:1] + [_without_start(plan) for plan in plans[1:]]
+    for i, plan in enumerate(plans):
+        later = (m for m in messages[i + 1 :] if set(plan.names) & set(m.content.joint_names))
+        end_ns = next((_stamp(message)[0] for message in later), np.inf)
+        plans[i] = plan.take(plan.stamp_ns < end_ns)
+    return plans
+
+
+def _targets(message: BagMessage, where: str) -> Rows:
+    """Return the points of a trajectory, each sent when the one before it was due.
+
+    One due at once is sent a nanosecond early, so that two never share a stamp.
+    """
+    names, points = tuple(message.content.joint_names), message.content.points
+    due_ns = np.array([_nanoseconds(point.time_from_start) for point in points])
+    before_ns = np.append(0, due_ns[:-1])
+    wrong = np.diff(due_ns, prepend=-1) <= 0
+    if wrong.any():
+        due, before = (float(ns[wrong][0]) / NS_PER_S for ns in (due_ns, before_ns))
+        raise InputError(
+            f"{where}: a point of a trajectory is due after {due:g} s, the one before it after "
+            f"{before:g} s. Expected times that increase from 0."
+        )
+    value = np.concatenate([_values(p.positions, names, "positions", where) for p in points])
+    duration = np.broadcast_to((due_ns - before_ns)[:, None] / NS_PER_S, value.shape)
+    return Rows(where, _stamp(message) + before_ns - (due_ns == 0), value, names, duration)
+
+
+def _without_start(plan: Rows) -> Rows:
+    """Return a later trajectory without the point that it starts from: that is no news."""
+    at_once = plan.duration is not None and not np.any(plan.duration[0] > 0.0)
+    return plan.take(slice(1, None)) if at_once and len(plan.value) > 1 else plan
+
+
+def _joined(parts: Sequence[Rows], where: str, first: Sequence[str], *, in_counts: bool) -> Rows:
+    """Return the rows of all messages by time; of those with the same stamp, the last counts.
 
     The columns `first` exist in any case.
     """
-    names = list(dict.fromkeys([*first, *(name for row in rows for name in row.names)]))
+    names = list(dict.fromkeys([*first, *(name for part in parts for name in part.names)]))
     column = {name: index for index, name in enumerate(names)}
-    stamps, place = np.unique(
-        np.array([row.stamp_ns for row in rows], dtype=np.int64), return_inverse=True
-    )
+    every = np.concatenate([np.empty(0, dtype=np.int64), *(part.stamp_ns for part in parts)])
+    stamps, place = np.unique(every, return_inverse=True)
     value, duration = np.full((2, len(stamps), len(names)), np.nan)
-    for row, at in zip(rows, place, strict=True):
-        columns = [column[name] for name in row.names]
-        value[at, columns] = row.value
-        duration[at, columns] = np.nan if row.duration is None else row.duration
-    timed = any(row.duration is not None for row in rows)
+    starts = np.cumsum([0, *(len(part.stamp_ns) for part in parts)])
+    for part, start, end in zip(parts, starts[:-1], starts[1:], strict=True):
+        columns = np.array([column[name] for name in part.names], dtype=np.int64)
+        cells = np.ix_(place[start:end], columns)
+        value[cells] = part.value
+        duration[cells] = np.nan if part.duration is None else part.duration
+    timed = any(part.duration is not None for part in parts)
     return Rows(where, stamps, value, tuple(names), duration if timed else None, in_counts)

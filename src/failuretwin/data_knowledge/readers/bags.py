@@ -54,10 +54,9 @@ def read_bag(path: Path, robot: Robot, topics: BagTopics | None = None) -> Timed
             topics, or lacks a joint.
     """
     recording = _Recording(path, robot, topics or BagTopics())
-    command, tool = recording.needed_rows("command"), recording.rows("tool")
-    position = recording.needed_rows("position") if tool is None else recording.rows("position")
+    command, tool = recording.commands(), recording.rows("tool")
+    position = recording.rows("position", needed=tool is None)
     goal = recording.rows("goal")
-    _check_commanded(command, robot)
     if tool is None and position is not None:
         _check_whole(position)
     zero_ns = _first_stamp([t for t in (command, tool, position) if t is not None], path)
@@ -87,12 +86,9 @@ def read_targets(path: Path, robot: Robot) -> Targets | None:
     fitting = recording.fitting
     if fitting["tool"] or fitting["position"] or not fitting["command"]:
         return None
-    command = recording.needed_rows("command")
-    if command.duration is None:
-        return None
-    _check_commanded(command, robot)
-    targets = _command(command, None, int(command.stamp_ns[0]))
-    return targets if isinstance(targets, Targets) else None
+    rows = recording.commands()
+    command = _command(rows, None, int(rows.stamp_ns[0])) if len(rows.stamp_ns) else None
+    return command if isinstance(command, Targets) else None
 
 
 # Which topic of a recording is what: commands, the tool's position, motor readings.
@@ -151,11 +147,24 @@ class _Recording:
         names = {topic.name for topics in self.fitting.values() for topic in topics}
         return read_messages(self.path, sorted(names))
 
-    def rows(self, role: Role) -> Rows | None:
-        """Return the rows of the topic for a role; topics of other joints only do not count.
+    def commands(self) -> Rows:
+        """Return the rows of the topic with the commands, each motor with a value somewhere.
 
         Raises:
-            InputError: If there are several topics, or a motor is missing.
+            InputError: If there is none, or as `rows`.
+        """
+        rows = cast("Rows", self.rows("command", needed=True))
+        never = np.flatnonzero(~np.isfinite(rows.value).any(axis=0))
+        if len(never):
+            names = ", ".join(self.robot.motor_names[k] for k in never)
+            raise InputError(f"{rows.where}: no command holds a value for {names}. Record them.")
+        return rows
+
+    def rows(self, role: Role, *, needed: bool = False) -> Rows | None:
+        """Return the rows of the topic for a role; a topic of other joints counts only if needed.
+
+        Raises:
+            InputError: If there are several topics, none that is needed, or a motor is missing.
         """
         read = {topic: self._read(topic, role) for topic in self.fitting[role]}
         ours = [t for t in read if role == "tool" or _names_a_motor(read[t].names, self.robot)]
@@ -166,27 +175,16 @@ class _Recording:
                 f"as {example}, under [topics] in a TOML file for --columns or in BagTopics in "
                 "Python."
             )
-        if not ours:
-            return None
-        rows = read[ours[0]]
-        return rows if role == "tool" else motor_rows(rows, self.robot)
-
-    def needed_rows(self, role: Role) -> Rows:
-        """Return the rows of the topic for a role of the motors.
-
-        Raises:
-            InputError: If there is none, or as `rows`.
-        """
-        rows, fitting = self.rows(role), self.fitting[role]
-        if rows is not None:
-            return rows
-        if fitting:  # refused for the joints that it names
-            return motor_rows(self._read(fitting[0], role), self.robot)
-        raise InputError(
-            f"{self.path}: holds {EXPECTED[role]}; if another topic holds them, name it under "
-            "[topics] in a TOML file for --columns or in BagTopics in Python. Found: "
-            f"{_listed(self.found)}."
-        )
+        if needed and not read:
+            raise InputError(
+                f"{self.path}: holds {EXPECTED[role]}; if another topic holds them, name it under "
+                "[topics] in a TOML file for --columns or in BagTopics in Python. Found: "
+                f"{_listed(self.found)}."
+            )
+        chosen = [read[topic] for topic in ours] or list(read.values())[: int(needed)]
+        if role == "tool" or not chosen:
+            return chosen[0] if chosen else None
+        return motor_rows(chosen[0], self.robot)
 
     def _read(self, topic: BagTopic, role: Role) -> Rows:
         kind = cast("Kind", topic.kind)  # one that fits the role
@@ -223,10 +221,9 @@ def motor_rows(rows: Rows, robot: Robot) -> Rows:
         # A reading out of range is a glitch; a command out of range is one for the end stop.
         sound = np.isfinite(angle) if rows.duration is not None else units.valid(angle)
         angle = np.where(sound, units.to_rad(angle), np.nan)
-    said = np.asarray(np.isfinite(angle).any(axis=1))
-    duration = None if rows.duration is None else rows.duration[said][:, columns]
-    names = tuple(robot.motor_names)
-    return Rows(rows.where, rows.stamp_ns[said], angle[said], names, duration)
+    duration = None if rows.duration is None else rows.duration[:, columns]
+    motors = Rows(rows.where, rows.stamp_ns, angle, tuple(robot.motor_names), duration)
+    return motors.take(np.asarray(np.isfinite(angle).any(axis=1)))
 
 
 def _names_a_motor(names: Sequence[str], robot: Robot) -> bool:
@@ -271,14 +268,6 @@ def _schemes(robot: Robot, *, in_counts: bool) -> dict[str, list[str]]:
             del bus["servo numbers"]
     arm = {"joints": [motor.joint for motor in robot.motors], "motors": robot.motor_names}
     return bus | arm if in_counts else arm | bus
-
-
-def _check_commanded(command: Rows, robot: Robot) -> None:
-    """Raise an InputError if a motor is named in commands but never given a value."""
-    never = np.flatnonzero(~np.isfinite(command.value).any(axis=0))
-    if len(never):
-        names = ", ".join(robot.motor_names[k] for k in never)
-        raise InputError(f"{command.where}: no command holds a value for {names}. Record them.")
 
 
 def _check_whole(position: Rows) -> None:

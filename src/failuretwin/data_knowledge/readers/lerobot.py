@@ -168,6 +168,11 @@ def _all_frames(path: Path, channel_of: Mapping[str, list[int]]) -> dict[str, Fl
         if len(table) == 0:
             raise InputError(f"{path}: holds no frames. Record at least one episode.")
         columns = {name: as_floats(table[name]) for name in (EPISODE, FRAME)}
+        if not np.isfinite([*columns.values()]).all():
+            raise InputError(
+                f"{path}: {EPISODE} and {FRAME} have rows without a number. Expected the number of "
+                "the episode and of the frame in each row. Fetch the data set again."
+            )
         for name, channels in channel_of.items():
             columns[name] = as_floats(np.stack(table[name].to_numpy())[:, channels])
         return columns

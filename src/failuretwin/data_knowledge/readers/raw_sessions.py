@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -14,16 +14,16 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.core.movements import Movements
 from failuretwin.core.runs import STEP_S, RunTable, Truth, concatenate
-from failuretwin.core.types import MS_PER_S, FloatArray, as_floats
+from failuretwin.core.types import MS_PER_S, FloatArray
 from failuretwin.data_knowledge.readers.table import Table
 from failuretwin.data_knowledge.readers.timed_log import (
     Samples,
-    check_clock,
-    check_grid,
-    on_grid,
+    Targets,
+    TimedLog,
+    gridded,
     path_of_readings,
+    uniform_grid,
 )
 from failuretwin.digital_model.robot import Robot
 
@@ -224,65 +224,36 @@ def session_runs(
         InputError: If the session holds no complete run.
     """
     label = label_of(session) if published_labels else None
-    window_of = _measured_window if how == "measured" else _published_window
     spans = split_session(session, robot)
     for span in spans:
         _check_length(session, span)
-    parts = []
-    for number, span in enumerate(spans, 1):
-        name, window = f"{session.name}/run_{number:02d}", window_of(session, robot, span)
-        parts.append(_run(session, robot, span, window, name, label).to_dataset())
-    return concatenate(parts)
-
-
-@dataclass(frozen=True)
-class _Window:
-    """Time window of one run: its start by the session's clock, its grid, and readings within it.
-
-    `time` (time,) and `at` (reading,) count from `begin` [s]; `initial` (motor,) and `counts`
-    (reading, motor) are counts, NaN where a reading is lost.
-    """
-
-    begin: float
-    time: FloatArray
-    initial: FloatArray
-    at: FloatArray
-    counts: FloatArray
-
-
-def _run(
-    session: RawSession,
-    robot: Robot,
-    span: range,
-    window: _Window,
-    name: str,
-    label: int | None,
-) -> RunTable:
-    units, rows, time = robot.servo_units, slice(span.start, span.stop), window.time
-    movements = Movements(
-        initial=units.to_rad(window.initial)[None],
-        target=units.to_rad(session.target_counts[rows])[None],
-        ramp_duration=session.ramp_s[rows][None],
-        start=(session.command_time[rows] - window.begin)[None],
+    runs = [_run(session, robot, span, how, label) for span in spans]
+    names = [f"{session.name}/run_{number:02d}" for number in range(1, len(runs) + 1)]
+    return concatenate(
+        [replace(run, run=[name]).to_dataset() for run, name in zip(runs, names, strict=True)]
     )
-    angle, held = units.to_rad(window.counts), np.nan
-    if label is not None and 1 <= label <= len(robot.motors):
-        freeze, frozen = PUBLISHED_TIME[PUBLISHED_FREEZE], angle[:, label - 1]
-        raw = session.reading_counts[:, label - 1]
-        held = float(units.to_rad(np.interp(freeze, session.reading_time - window.begin, raw)))
-        frozen[(window.at >= freeze) & np.isfinite(frozen)] = held
-    position = on_grid(Samples(window.at, angle), time)
-    return RunTable(
-        run=[name],
-        motor=robot.motor_names,
-        time=time,
-        command=movements.reference(time),
-        measured=path_of_readings(position, robot)[None],
-        measured_rate_hz=READING_RATE_HZ,
-        movements=movements,
-        truth=None if label is None else _truth(label, held, robot),
-        position=position[None],
+
+
+def _run(session: RawSession, robot: Robot, span: range, how: As, label: int | None) -> RunTable:
+    window = _measured_window if how == "measured" else _published_window
+    begin, time, readings = window(session, robot, span)
+    units, rows = robot.servo_units, slice(span.start, span.stop)
+    initial = _initial_counts(session, span, begin, how)
+    command = Targets(
+        time=session.command_time[rows] - begin,
+        target=units.to_rad(session.target_counts[rows]),
+        duration=session.ramp_s[rows],
+        initial=units.to_rad(initial),
     )
+    position = Samples(readings.time, units.to_rad(readings.value))
+    truth = None if label is None else _frozen(label, position, session, begin, robot)
+    tool = Samples(readings.time, path_of_readings(position.value, robot))
+    log = TimedLog(session.name, command, position=position)
+    return replace(gridded(log, tool, robot, time, 0.0, READING_RATE_HZ), truth=truth)
+
+
+_Window = tuple[float, FloatArray, Samples]
+"""Start of a run by the session's clock, its time grid from there, and its readings in counts."""
 
 
 def _measured_window(session: RawSession, robot: Robot, span: range) -> _Window:
@@ -294,19 +265,14 @@ def _measured_window(session: RawSession, robot: Robot, span: range) -> _Window:
     end = float(np.append(session.command_time, np.inf)[span.stop])
     end = min(end, float(stamps[-1]))
     both = np.concatenate([session.command_time[span.start : span.stop], stamps])
-    check_clock(both[(both >= begin) & (both <= end)], str(session.folder))
-    check_grid((end - begin) / STEP_S, len(both), str(session.folder))
+    inside = both[(both >= begin) & (both <= end)]
+    time = uniform_grid(inside, end - begin, STEP_S, str(session.folder))
     # A reading before a gap stalled: it was taken at some time within the gap.
     stalled = np.append(np.diff(stamps) > GAP_S, False)
     kept = (stamps >= begin) & (stamps <= end) & ~stalled
     counts = session.reading_counts[kept]
-    return _Window(
-        begin,
-        as_floats(np.arange(round((end - begin) / STEP_S) + 1) * STEP_S),
-        _initial_counts(session, span, begin),
-        stamps[kept] - begin,
-        np.where(robot.servo_units.valid(counts), counts, np.nan),
-    )
+    counts = np.where(robot.servo_units.valid(counts), counts, np.nan)
+    return begin, time, Samples(stamps[kept] - begin, counts)
 
 
 def _published_window(session: RawSession, robot: Robot, span: range) -> _Window:
@@ -317,13 +283,9 @@ def _published_window(session: RawSession, robot: Robot, span: range) -> _Window
             f"{session.folder}: no reading before the first command of a run, which the published "
             "form starts from. Read it as measured."
         )
-    first = int(np.searchsorted(session.reading_time, begin))
     at = session.reading_time - begin
-    lines = [
-        np.interp(PUBLISHED_TIME, at, motor, right=np.nan) for motor in session.reading_counts.T
-    ]
-    counts = np.stack(lines, axis=1)
-    return _Window(begin, PUBLISHED_TIME, session.reading_counts[first], PUBLISHED_TIME, counts)
+    lines = [np.interp(PUBLISHED_TIME, at, m, right=np.nan) for m in session.reading_counts.T]
+    return begin, PUBLISHED_TIME, Samples(PUBLISHED_TIME, np.stack(lines, axis=1))
 
 
 def _last_reading_before(session: RawSession, stamp: float) -> float | None:
@@ -342,13 +304,13 @@ def _check_length(session: RawSession, span: range) -> None:
         )
 
 
-def _initial_counts(session: RawSession, span: range, begin: float) -> FloatArray:
+def _initial_counts(session: RawSession, span: range, begin: float, how: As) -> FloatArray:
     """Return where the first ramp starts, (motor,) [counts].
 
     It is the target before it, where the session holds one; else the reading at the start, as
     published; else (the log starts later) the first target, so that no ramp is seen.
     """
-    if span.start > 0:
+    if span.start > 0 and how == "measured":
         return session.target_counts[span.start - 1]
     index = int(np.searchsorted(session.reading_time, begin))
     if session.reading_time[index] > session.command_time[span.start]:
@@ -356,8 +318,17 @@ def _initial_counts(session: RawSession, span: range, begin: float) -> FloatArra
     return session.reading_counts[index]
 
 
-def _truth(label: int, held: float, robot: Robot) -> Truth:
-    stuck = 1 <= label <= len(robot.motors)
+def _frozen(
+    label: int, position: Samples, session: RawSession, begin: float, robot: Robot
+) -> Truth:
+    """Return the truth of a label; the motor of a stuck one is frozen in the readings [rad]."""
+    stuck, held = 1 <= label <= len(robot.motors), np.nan
+    if stuck:
+        freeze, angle = PUBLISHED_TIME[PUBLISHED_FREEZE], position.value[:, label - 1]
+        raw = session.reading_counts[:, label - 1]
+        counts = np.interp(freeze, session.reading_time - begin, raw)
+        held = float(robot.servo_units.to_rad(counts))
+        angle[(position.time >= freeze) & np.isfinite(angle)] = held
     fault = str(paper_hypotheses(robot.motor_names)[label])
     return Truth(
         fault=[fault],

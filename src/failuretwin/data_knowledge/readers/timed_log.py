@@ -53,11 +53,14 @@ class Targets:
         time: When each was sent, (command,) [s].
         target: (command, motor) [rad].
         duration: (command, motor) [s].
+        initial: Where the first ramp starts, (motor,) [rad]; None: at the last reading before it,
+            or where there is none at the first target, so that no ramp is seen.
     """
 
     time: FloatArray
     target: FloatArray
     duration: FloatArray
+    initial: FloatArray | None = None
 
 
 def held(target: FloatArray) -> FloatArray:
@@ -106,26 +109,32 @@ def timed_run(log: TimedLog, robot: Robot) -> RunTable:
     tool = _tool_path(log, robot)
     _check_commands(log)
     stamps = np.unique(np.concatenate([log.command.time, tool.time]))
-    check_clock(stamps, log.name)
     begin, end = stamps[0], max(tool.time[-1], stamps[0] + STEP_S)
-    step = _grid_step(stamps, tool)
-    check_grid((end - begin) / step, len(stamps), log.name)
-    time = as_floats(np.arange(round((end - begin) / step) + 1) * step)
+    time = uniform_grid(stamps, end - begin, _grid_step(stamps, tool), log.name)
+    return gridded(log, tool, robot, time, begin, tool.rate_hz)
+
+
+def gridded(
+    log: TimedLog, tool: Samples, robot: Robot, time: FloatArray, begin: float, rate_hz: float
+) -> RunTable:
+    """Return a log as a run on the grid `time` (time,), which counts from `begin` [s]."""
+
+    def placed(samples: Samples) -> FloatArray:
+        return on_grid(samples, time, begin)[None]
+
     command, movements = _command(log, time, begin)
     return RunTable(
         run=[log.name],
         motor=robot.motor_names,
         time=time,
         command=command[None],
-        measured=on_grid(tool, time, begin)[None],
-        measured_rate_hz=tool.rate_hz,
+        measured=placed(tool),
+        measured_rate_hz=rate_hz,
         movements=movements,
-        position=None if log.position is None else on_grid(log.position, time, begin)[None],
+        position=None if log.position is None else placed(log.position),
         sensors={
-            name: on_grid(samples, time, begin).reshape(
-                1, len(time), *SHAPES.get(name, samples.value.shape[1:])
-            )
-            for name, samples in log.sensors.items()
+            name: placed(one).reshape(1, len(time), *SHAPES.get(name, one.value.shape[1:]))
+            for name, one in log.sensors.items()
         },
     )
 
@@ -208,32 +217,34 @@ def _check_times(time: FloatArray, name: str) -> None:
         )
 
 
-def check_clock(time: FloatArray, where: str) -> None:
-    """Raise InputError if `time` [s], in any order, holds a silence that no log can mean."""
-    time = np.sort(time)
-    steps = np.diff(time)
+def uniform_grid(stamps: FloatArray, length: float, step: float, where: str) -> FloatArray:
+    """Return the time grid of a run, (time,) [s].
+
+    Args:
+        stamps: Times of its commands and readings, in any order [s].
+        length: Its end [s].
+        step: Step of the grid [s].
+        where: Its name, for the error text.
+
+    Raises:
+        InputError: If the stamps hold a silence that no log can mean, or the grid has far more
+            samples than there are stamps.
+    """
+    stamps = np.sort(stamps)
+    steps = np.diff(stamps)
     if len(steps) and steps.max() > LONGEST_SILENCE_S:
-        before = float(time[int(np.argmax(steps))] - time[0])
+        before = float(stamps[int(np.argmax(steps))] - stamps[0])
         raise InputError(
             f"{where}: the clock jumps by {steps.max():.0f} s, {before:.1f} s after the start. "
             "Cut the log there."
         )
-
-
-def check_grid(samples: float, stamps: int, where: str) -> None:
-    """Raise InputError if a time grid has far more samples than there are stamps in a log.
-
-    Args:
-        samples: Samples of the grid.
-        stamps: Commands and readings of the log.
-        where: Its name, for the error text.
-    """
-    if samples > max(SAMPLES_ALWAYS, SAMPLES_PER_STAMP * stamps):
+    if length / step > max(SAMPLES_ALWAYS, SAMPLES_PER_STAMP * len(stamps)):
         raise InputError(
-            f"{where}: its {stamps} commands and readings lie {samples:.2g} steps of the time grid "
-            f"apart, expected {SAMPLES_PER_STAMP} steps each at most. Check the unit of its times: "
-            "milliseconds may have been taken for seconds."
+            f"{where}: its {len(stamps)} commands and readings lie {length / step:.2g} steps of "
+            f"the time grid apart, expected {SAMPLES_PER_STAMP} steps each at most. Check the unit "
+            "of its times: milliseconds may have been taken for seconds."
         )
+    return as_floats(np.arange(round(length / step) + 1) * step)
 
 
 def _command(log: TimedLog, time: FloatArray, begin: float) -> tuple[FloatArray, Movements | None]:
@@ -251,16 +262,14 @@ def _command(log: TimedLog, time: FloatArray, begin: float) -> tuple[FloatArray,
 
 
 def _initial(log: TimedLog, command: Targets) -> FloatArray:
-    """Return where the first ramp starts, (motor,) [rad]: the last reading before it, if any.
-
-    Otherwise the first target, so that no ramp is seen.
-    """
+    """Return where the first ramp starts, (motor,) [rad]; see `Targets`."""
+    if command.initial is not None:
+        return command.initial
     if log.position is not None:
-        before = (log.position.time <= command.time[0]) & np.isfinite(log.position.value).all(
-            axis=1
-        )
-        if before.any():
-            return log.position.value[np.flatnonzero(before)[-1]]
+        whole = np.isfinite(log.position.value).all(axis=1)
+        before = np.flatnonzero((log.position.time <= command.time[0]) & whole)
+        if len(before):
+            return log.position.value[before[-1]]
     return command.target[0]
 
 
