@@ -99,14 +99,14 @@ def test_a_random_walk_adds_its_variance(belief):
 def said_of_scatter(robot, evidence, factor=1.0, motor=0):
     """Return what runs say as healthy ones, with the scatter of one motor some times as large.
 
-    Motor 4, which there is not, stands for the degrees of freedom.
+    Motors 4 and 5, which there are not, stand for the degrees of freedom and the noise.
     """
-    figures = np.array([*SETTLING.scatter, SETTLING.tail_dof])
+    figures = np.array([*SETTLING.scatter, SETTLING.tail_dof, 1.0])
     figures[motor] *= factor
-    *scatter, dof = figures.tolist()
+    *scatter, dof, noise = figures.tolist()
     settling = replace(SETTLING, scatter=tuple(scatter), tail_dof=dof)
     sharp = replace(CALIBRATION, settling=settling, variation=None)
-    model = HealthyModel(DigitalTwin(robot), sharp)
+    model = HealthyModel(DigitalTwin(robot), sharp, noise_factor=noise)
     likelihood, layout = RunLikelihood(evidence, model), Layout(4, geometry=False)
     known = Components.normal_of(np.diag(np.full(layout.size, 1e-12)), model.path_noise)
     place = np.zeros((len(evidence.usable), 7))
@@ -117,7 +117,7 @@ def said_of_scatter(robot, evidence, factor=1.0, motor=0):
     return weighing.evidence.by_hypothesis[:, 0], score
 
 
-@pytest.mark.parametrize("motor", [0, 1, 3, 4])
+@pytest.mark.parametrize("motor", [0, 1, 3, 4, 5])
 def test_the_score_of_the_scatter_is_a_derivative(armpi, motor):
     evidence, step = seen(armpi, truth(12), 8), 1e-4
     _, score = said_of_scatter(armpi, evidence)

@@ -255,15 +255,14 @@ def test_scatter_is_where_its_posterior_is_highest(twin, monkeypatch):
     monkeypatch.setattr(folder, "PASSES", 12)
     monkeypatch.setattr(engine_theta, "ODD_FACTOR", 1.0)
     found = folder_posterior(RunLikelihood(one.evidence, one.model), HEALTHY, SURE)
-    best = optimize.minimize(scatter_height(one, found.mean), np.zeros(5), method="BFGS").x
-    learned = np.array(found.model.settling.scatter) / SETTLING.scatter
-    learned = np.log([*learned, found.model.path_noise / one.model.path_noise])
+    best = optimize.minimize(scatter_height(one, found.mean), np.zeros(4), method="BFGS").x
+    learned = np.log(np.array(found.model.settling.scatter) / SETTLING.scatter)
     np.testing.assert_allclose(learned, best, atol=0.02)
     assert (np.abs(best) > 0.05).any()
 
 
 def scatter_height(one, theta):
-    """Return minus the log posterior of log scatter and noise beside those given, by these."""
+    """Return minus the log posterior of the log scatter beside that given, as a function of it."""
     evidence, model = one.evidence, one.model.without_doubt
     target = evidence.movements.target
     direction = np.sign(target - evidence.movements.origin()).reshape(-1, 4)
@@ -287,13 +286,11 @@ def scatter_height(one, theta):
     common = design * prior @ (design * prior).T
 
     def height(change):
-        lever = jacobian * np.array(SETTLING.scatter) * np.exp(change[:4])
-        noise = model.path_noise * np.exp(change[4])
-        own = lever @ np.swapaxes(lever, 1, 2) + noise**2 * np.eye(3)
+        lever = jacobian * np.array(SETTLING.scatter) * np.exp(change)
+        own = lever @ np.swapaxes(lever, 1, 2) + model.path_noise**2 * np.eye(3)
         covariance = common + block_diag(*own)
         square = off @ np.linalg.solve(covariance, off)
-        prior = np.sum((change / np.array([0.3] * 4 + [1.2])) ** 2)
-        return 0.5 * (square + np.linalg.slogdet(covariance)[1] + prior)
+        return 0.5 * (square + np.linalg.slogdet(covariance)[1] + np.sum((change / 0.3) ** 2))
 
     return height
 

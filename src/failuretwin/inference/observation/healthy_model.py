@@ -194,10 +194,10 @@ class HealthyModel:
 
     @property
     def knows_noise(self) -> bool:
-        """Whether somebody has measured the noise of the sensor."""
-        fitted = self.twin.robot.profile.geometry.sensor_noise_m > 0.0
-        known = self.imperfections
-        return fitted or known.settling is None or known.readings is not None
+        """Whether the noise of the sensor is known: measured, or that of the motors' readings."""
+        profile, known = self.twin.robot.profile, self.imperfections
+        measured = profile.geometry.sensor_noise_m > 0.0 or known.readings is not None
+        return measured or known.settling is None or profile.sensor_pose == "log"
 
     @property
     def _known_noise(self) -> float:
