@@ -16,8 +16,6 @@ from failuretwin.app.terminal import show, tell
 from failuretwin.core.errors import InputError
 
 if TYPE_CHECKING:
-    from failuretwin.app.records import DiagnosisKeeper
-    from failuretwin.digital_model.calibrated_robot import CalibratedRobot
     from failuretwin.inference.together.fault_course import FaultCourse
 
 BAYES_ONLY = (
@@ -40,7 +38,8 @@ LEARNING = ("out", "independent")
     "--track",
     "Learn the robot run by run: judge each by those before it. Give runs "
     "in their order, the oldest first. Without --calibration it begins with the arm class. The "
-    "history is kept beside the calibration, or beside --out (FILE.history.jsonl).",
+    "history is kept in the --store, else beside the calibration, or beside --out "
+    "(FILE.history.jsonl).",
 )
 @opt.flag_option(
     "--self-calibrate",
@@ -137,9 +136,8 @@ def diagnose(
     from failuretwin.inference.observation.sensors import TOOL_ALONE, sensing_of
 
     offsets.check_correctable(reading.logs, correct)
-    calibration, together = robot.calibration, track or self_calibrate
-    keeper = memory.keeper(reading, recorded)
-    known = _known(keeper, robot, together)
+    together, (stored, known) = track or self_calibrate, memory.look_up(robot)
+    keeper = None if stored is None else stored.keeper(reading, recorded)
     bayes = ft.BayesDiagnoser(
         known.twin,
         imperfections=known.imperfections,
@@ -149,16 +147,17 @@ def diagnose(
     )
     _refuse_unused(method == given.BAYES, track, self_calibrate)
     diagnoser = given.chosen_diagnoser(method, bayes)
-    history = learning.opened_history(bayes, calibration, out) if track else None
+    start = learning.Start(robot.calibration, out, stored)
+    tracking = learning.Tracking(bayes, start) if track else None
     runs = reading.runs(known.robot) if keeper is None else keeper.runs(known.robot)
     sensed = sensing_of(runs, sensing)
     given.warn_mismatch(runs, given.expected_name(diagnoser))
     if together:
         learning.check_learning_from(sensed)
-    if history is not None:
-        found = learning.tracked(runs, bayes, history, out)
+    if tracking is not None:
+        found = tracking.diagnose(runs)
     elif self_calibrate:
-        found = learning.self_calibrated(runs, bayes, calibration, out)
+        found = learning.self_calibrated(runs, bayes, start)
     else:
         found = learning.Findings(diagnoser.diagnose(runs), bayes)
     diagnoses = given.with_doubts(found.diagnoses, runs, known.twin)
@@ -171,7 +170,8 @@ def diagnose(
     if report is not None:
         write_report(runs, diagnoses, known.twin, state, report, found.sections)
         tell(f"the page: {report / 'index.html'}", err=True)
-    found.keep()
+    remembered = [] if keeper is None else ["", *keeper.remember(diagnoses)]
+    found.keep(None if keeper is None else keeper.latest)
     show(*reports.diagnosis_parts(diagnoses))
     if method == given.BAYES and sensed == TOOL_ALONE:
         show(*isolability_summary(runs, found.bayes))
@@ -180,18 +180,7 @@ def diagnose(
     last = [*reports.course_lines(course, state, known.robot), *found.lines]
     show(*([""] if last else []), *last)
     show(*offsets.offset_lines(runs, known, diagnoses, reading, correct))
-    if keeper is not None:
-        show("", *keeper.remember(diagnoses, robot.model))
-
-
-def _known(
-    keeper: DiagnosisKeeper | None, robot: opt.RobotOptions, learning: bool
-) -> CalibratedRobot:
-    """Return the robot as calibrated by `--calibration`, or in the store where none is named."""
-    stored = None
-    if keeper is not None and robot.calibration is None and not learning:
-        stored = keeper.calibrated(robot.model)
-    return stored or robot.known
+    show(*remembered)
 
 
 def _write(
