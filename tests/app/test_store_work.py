@@ -20,7 +20,7 @@ from failuretwin.app.shadow import Change, Snapshot
 from failuretwin.app.watch_keeper import begin_watch
 from failuretwin.connection.links.base import OK, Answer
 from failuretwin.core.hypothesis import ALL_CLEAR, RAISED, Alarm
-from failuretwin.data_knowledge.records.writing import Basis
+from failuretwin.data_knowledge.records.rows import Basis
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from store_places import diagnosis
 
@@ -214,7 +214,11 @@ def test_a_robot_in_the_store_is_followed_as_by_files(
     again = run("diagnose", days / "day_0.nc", "--track", "--store", place.url, *NAME)
     assert "0 runs learned, 8 in all, 4 known already" in again.stdout
     assert place.sql("SELECT count(*), max(runs) FROM beliefs") == [("2", "8")]
-    assert not (tmp_path / "cal.history.jsonl").read_text().count("arm_7")
+    told = run("history", "arm_7", "--store", place.url, "--report", "page").stdout
+    (line,) = (line for line in told.splitlines() if line.startswith("motor_2  compliance"))
+    page = (tmp_path / "page" / "index.html").read_text("utf-8")
+    for cell in line.split("  "):
+        assert cell.strip() in page
 
 
 def test_a_belief_of_another_calibration_is_not_used_and_begins_anew(run, file, days, armpi):

@@ -28,9 +28,9 @@ from failuretwin.data_knowledge.records import migrations
 from failuretwin.data_knowledge.records.beliefs import Belief, BeliefLine
 from failuretwin.data_knowledge.records.database import Database
 from failuretwin.data_knowledge.records.offsets import MotorOffset
+from failuretwin.data_knowledge.records.rows import Basis
 from failuretwin.data_knowledge.records.schema import CLOSES, metadata
 from failuretwin.data_knowledge.records.sessions import Note
-from failuretwin.data_knowledge.records.writing import Basis
 from full_disks import full_disk
 from store_places import diagnosis
 

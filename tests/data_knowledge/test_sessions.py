@@ -16,8 +16,8 @@ from failuretwin.data_knowledge.records import beliefs
 from failuretwin.data_knowledge.records.beliefs import Belief, BeliefLine
 from failuretwin.data_knowledge.records.log_files import LogFile
 from failuretwin.data_knowledge.records.offsets import MotorOffset
+from failuretwin.data_knowledge.records.rows import Basis
 from failuretwin.data_knowledge.records.sessions import Note
-from failuretwin.data_knowledge.records.writing import Basis
 from store_places import diagnosis
 
 START = datetime(2026, 3, 2, tzinfo=UTC)
@@ -231,3 +231,30 @@ def test_a_damaged_belief_gives_one_line(store, monkeypatch):
     keep(store, belief(1))
     with pytest.raises(InputError, match=r"damaged.*Restore the store from a copy"):
         store.belief("arm_7", LINE)
+
+
+# Wear.
+
+
+def test_the_history_shows_how_offsets_drift(store):
+    for number in range(101):
+        zero = MotorOffset("motor_1", "zero", 0.01 * number, 0.002, "rad")
+        log = LogFile("", None, 0, at(number))
+        told_of = [diagnosis(f"check {number}", "healthy")]
+        store.remember(told_of, "arm_7", log=log, command="check", offsets=[zero])
+    (drift,) = store.history("arm_7").drifts
+    assert (drift.motor, drift.name, drift.unit) == ("motor_1", "zero", "rad")
+    assert drift.change == pytest.approx(1.0)
+    assert len(drift.at) == 20
+    assert (drift.at[0], drift.at[-1]) == (at(0), at(100))
+    assert sorted(drift.values) == list(drift.values)
+
+
+def test_offsets_with_another_reference_are_left_out(store):
+    for number, method in enumerate(("old", "new", "new")):
+        bias = MotorOffset("motor_1", "bias", float(number), 0.002, "rad")
+        line = BeliefLine("diagnose", method)
+        given = belief(1, None if number < 2 else 2)
+        store.keep_belief("arm_7", Basis("track", None, method), line, given, at(number), [bias])
+    (drift,) = store.history("arm_7").drifts
+    assert drift.values == (1.0, 2.0)

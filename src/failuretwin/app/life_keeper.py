@@ -21,7 +21,7 @@ from failuretwin.connection.life_history import History, start_of
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.records.beliefs import Belief, BeliefLine
 from failuretwin.data_knowledge.records.offsets import MotorOffset
-from failuretwin.data_knowledge.records.writing import Basis
+from failuretwin.data_knowledge.records.rows import Basis
 from failuretwin.inference.together.life_filter import OFFSETS, LifeFilter
 
 
@@ -80,8 +80,8 @@ class LifeKeeper:
         """
         if not rows:
             return
-        record, known = self._stored, life.model.imperfections
-        basis = Basis("track", record.calibration_number, known.name, known.protocol)
+        record, begun = self._stored, life.begun
+        basis = Basis("track", record.calibration_number, f"begun with {begun.name}", "P1")
         belief = Belief(life.arrived, life.to_arrays(), rows, self._after)
         found = _offsets(life)
         record.store.keep_belief(

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from failuretwin.app.terminal import Part, Table
 from failuretwin.core.errors import counted
 from failuretwin.data_knowledge.records.history import FaultEpisode, History, state_counts
+from failuretwin.data_knowledge.records.offsets import Drift
 from failuretwin.data_knowledge.records.queries import QueryAnswer
 from failuretwin.data_knowledge.store import filling
 
@@ -29,6 +33,9 @@ def history_parts(history: History) -> list[Part]:
         parts.append(f"diagnosed: {state_counts(history.counts)}")
     if history.episodes:
         parts += ["", _episodes_table(history.episodes)]
+    wear = [one for one in history.drifts if len(one.at) > 1]
+    if wear:
+        parts += ["", _wear_table(wear)]
     if history.timeline:
         rows = [[_time(one.at), one.kind, one.text] for one in history.timeline]
         parts += ["", Table(["when (UTC)", "event", ""], rows, title="timeline")]
@@ -49,6 +56,37 @@ def _episodes_table(episodes: Sequence[FaultEpisode]) -> Table:
     ]
     headings = ["episode", "motor", "mode", "state", "since", "until", "finding"]
     return Table(headings, rows, "rllllll", title="fault episodes")
+
+
+SHOWN = {"rad": (180.0 / math.pi, "deg"), "m": (1e3, "mm")}
+"""Factor and unit in which an angle or a length is shown."""
+BLOCKS = "▁▂▃▄▅▆▇█"
+
+
+def _wear_table(drifts: Sequence[Drift]) -> Table:
+    """Return the offsets of the motors over time: first and last value, and the way between."""
+    rows = [_wear_row(one) for one in drifts]
+    headings = ["motor", "offset", "first", "last", "change", "unit", "over time"]
+    return Table(headings, rows, "llrrrll", title="wear (mean +- standard deviation)")
+
+
+def _wear_row(drift: Drift) -> list[str]:
+    base, slash, load = drift.unit.partition("/")
+    factor, unit = SHOWN.get(base, (1.0, base))
+    first, last = (
+        f"{factor * drift.values[k]:+.2f} +- {factor * drift.deviations[k]:.2f}" for k in (0, -1)
+    )
+    change = f"{factor * drift.change:+.2f}"
+    return [drift.motor, drift.name, first, last, change, unit + slash + load, _course(drift)]
+
+
+def _course(drift: Drift) -> str:
+    """Return the values as blocks; their height spans six deviations at least."""
+    values = np.asarray(drift.values)
+    low, high = values.min(), values.max()
+    span = max(high - low, 6.0 * float(np.median(drift.deviations)), 1e-12)
+    share = (values - 0.5 * (low + high)) / span + 0.5
+    return "".join(BLOCKS[int(one)] for one in np.round(share * (len(BLOCKS) - 1)))
 
 
 def _finding(episode: FaultEpisode) -> str:

@@ -19,9 +19,9 @@ from failuretwin.core.runs import concatenate
 from failuretwin.data_knowledge.records.history import FaultEpisode, StoredCalibration
 from failuretwin.data_knowledge.records.log_files import LogFile, log_file
 from failuretwin.data_knowledge.records.offsets import MotorOffset
+from failuretwin.data_knowledge.records.rows import Basis
 from failuretwin.data_knowledge.records.sessions import Note
 from failuretwin.data_knowledge.records.store import Remembered, Store
-from failuretwin.data_knowledge.records.writing import Basis
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, calibration_from_table
 from failuretwin.digital_model.robot import Robot
 

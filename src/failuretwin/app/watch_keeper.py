@@ -16,8 +16,8 @@ from failuretwin.connection.links.statuses import LEVELS, statuses
 from failuretwin.core.errors import OutputError
 from failuretwin.core.hypothesis import RAISED
 from failuretwin.data_knowledge.records.log_files import LogFile
+from failuretwin.data_knowledge.records.rows import Basis
 from failuretwin.data_knowledge.records.sessions import Note, Session
-from failuretwin.data_knowledge.records.writing import Basis
 
 RETRY_S = 5.0
 """Time after which a watch tries again to write to a store that failed [s]."""

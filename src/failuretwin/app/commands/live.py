@@ -158,7 +158,7 @@ def _begun(
     """Return what keeps a watch, whose session has begun; a source that is a path is a log."""
     from failuretwin.app.watch_keeper import begin_watch
     from failuretwin.data_knowledge.records.log_files import log_file
-    from failuretwin.data_knowledge.records.writing import Basis
+    from failuretwin.data_knowledge.records.rows import Basis
 
     healthy = known.imperfections
     method = f"watch, {sensing}; healthy behaviour: {healthy.name}"

@@ -11,6 +11,7 @@ import sqlalchemy as sa
 
 from failuretwin.core.errors import counted
 from failuretwin.data_knowledge.records.episodes import CLEARED, CONFIRMED, RAISED, SUSPECTED
+from failuretwin.data_knowledge.records.offsets import Drift, read_drifts
 from failuretwin.data_knowledge.records.schema import (
     calibrations,
     diagnoses,
@@ -172,6 +173,7 @@ class History:
         episodes: Fault episodes, the oldest first.
         calibrations: Calibrations, the oldest first.
         repairs: Repairs, the oldest first.
+        drifts: Offsets of the motors over time.
     """
 
     robot: str
@@ -182,6 +184,7 @@ class History:
     episodes: tuple[FaultEpisode, ...]
     calibrations: tuple[StoredCalibration, ...]
     repairs: tuple[Repair, ...]
+    drifts: tuple[Drift, ...] = ()
 
     @property
     def open_episodes(self) -> list[FaultEpisode]:
@@ -261,6 +264,7 @@ def read_history(connection: sa.Connection, row: int, robot: str) -> History:
         read_episodes(connection, row),
         read_calibrations(connection, row),
         _repairs(connection, row),
+        read_drifts(connection, row),
     )
 
 

@@ -14,6 +14,7 @@ from failuretwin.data_knowledge.records import writing
 from failuretwin.data_knowledge.records.database import Database
 from failuretwin.data_knowledge.records.episodes import RAISED, EpisodeTracker, NamedFault
 from failuretwin.data_knowledge.records.history import FaultEpisode, read_episodes
+from failuretwin.data_knowledge.records.rows import SessionRows, add_rows
 from failuretwin.data_knowledge.records.schema import notes
 
 
@@ -45,7 +46,7 @@ class Session:
         rows: Rows that it refers to.
     """
 
-    def __init__(self, database: Database, rows: writing.SessionRows) -> None:
+    def __init__(self, database: Database, rows: SessionRows) -> None:
         self._database = database
         self._rows = rows
         self._alarmed: tuple[str, ...] = ()
@@ -101,7 +102,7 @@ def _follow_note(
 
 def add_notes(
     connection: sa.Connection,
-    rows: writing.SessionRows,
+    rows: SessionRows,
     happened: Sequence[Note],
     behind: Sequence[int | None] = (),
 ) -> None:
@@ -112,4 +113,4 @@ def add_notes(
         {**of, "at": one.at, "text": one.text, "diagnosis_id": row}
         for one, row in zip(happened, known, strict=True)
     ]
-    writing.add_rows(connection, notes, stated)
+    add_rows(connection, notes, stated)

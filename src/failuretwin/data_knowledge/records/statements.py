@@ -16,6 +16,7 @@ from failuretwin.data_knowledge.records.history import (
     read_calibrations,
     read_episodes,
 )
+from failuretwin.data_knowledge.records.rows import add_rows
 from failuretwin.data_knowledge.records.schema import calibrations, findings
 
 
@@ -40,7 +41,7 @@ def add_finding(
             "`failuretwin found`."
         )
     of = {"episode_id": episode.row, "withdraws": standing and standing.number}
-    writing.add_rows(connection, findings, [{**stated, **of, "at": datetime.now(UTC)}])
+    add_rows(connection, findings, [{**stated, **of, "at": datetime.now(UTC)}])
     return _episode(connection, row, robot, number)
 
 
@@ -73,7 +74,7 @@ def replace_calibration(
     if current is not None:
         _close(connection, current, start)
     row = {**stated, "robot_id": robot, "valid_from": start}
-    writing.add_rows(connection, calibrations, [row])
+    add_rows(connection, calibrations, [row])
     return read_calibrations(connection, robot)[-1]
 
 

@@ -41,13 +41,13 @@ from failuretwin.data_knowledge.records.history import (
 from failuretwin.data_knowledge.records.log_files import LogFile, log_file, utc
 from failuretwin.data_knowledge.records.offsets import MotorOffset, add_offsets
 from failuretwin.data_knowledge.records.reading import StoreReader
+from failuretwin.data_knowledge.records.rows import Basis, SessionRows, add_rows
 from failuretwin.data_knowledge.records.schema import repairs
 from failuretwin.data_knowledge.records.sessions import Note, Session, add_notes
 from failuretwin.data_knowledge.records.statements import (
     add_finding,
     replace_calibration,
 )
-from failuretwin.data_knowledge.records.writing import Basis, SessionRows
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
@@ -294,7 +294,7 @@ class Store(StoreReader):
                 check_name("motor", motor, motors)
             stated = {"motor": motor, "part": part, "person": person, "note": note}
             when = {"robot_id": row, "at": _or_now(at)}
-            writing.add_rows(connection, repairs, [{**stated, **when}])
+            add_rows(connection, repairs, [{**stated, **when}])
 
     # Calibrations.
 

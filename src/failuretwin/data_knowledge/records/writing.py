@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
@@ -24,6 +24,7 @@ from failuretwin.data_knowledge.records.episodes import (
 )
 from failuretwin.data_knowledge.records.history import read_episodes
 from failuretwin.data_knowledge.records.log_files import LogFile
+from failuretwin.data_knowledge.records.rows import Basis, SessionRows, add_rows
 from failuretwin.data_knowledge.records.schema import (
     diagnoses,
     episode_events,
@@ -38,16 +39,6 @@ from failuretwin.data_knowledge.records.schema import (
 )
 from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.digital_model.robot import Robot
-
-
-def add_rows(
-    connection: sa.Connection, table: sa.Table, rows: Sequence[Mapping[str, Any]]
-) -> list[int]:
-    """Insert rows and return their ids in the same order."""
-    if not rows:
-        return []
-    statement = sa.insert(table).returning(table.c.id, sort_by_parameter_order=True)
-    return list(connection.scalars(statement, [dict(row) for row in rows]))
 
 
 def find_robot(connection: sa.Connection, name: str) -> int:
@@ -162,32 +153,6 @@ def keep_runs(
 
 
 # Sessions.
-
-
-@dataclass(frozen=True)
-class SessionRows:
-    """Rows that a session refers to: its own, that of its robot, and that of its run."""
-
-    session: int
-    robot: int
-    run: int | None = None
-
-
-@dataclass(frozen=True)
-class Basis:
-    """What the results of a session rest on.
-
-    Attributes:
-        command: The command.
-        calibration: Row of the calibration; None: none of the store.
-        method: Method of diagnosis; empty: nothing is diagnosed.
-        protocol: Real data that it uses: P0, P0c, P1 or P2; empty: nothing is diagnosed.
-    """
-
-    command: str
-    calibration: int | None = None
-    method: str = ""
-    protocol: str = ""
 
 
 def add_session(connection: sa.Connection, robot: int, basis: Basis) -> int:
