@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import shutil
 import signal
@@ -255,7 +256,7 @@ def test_a_watch_goes_on_from_what_earlier_ones_have_learned(run, place, store):
 
 def test_tracking_a_watch_needs_a_store(run):
     said = run("watch", "emulated", "--track", code=2).stderr
-    assert "--track keeps what the robot teaches in a store" in said
+    assert "--track needs a store. Name one: --store robots.db." in said
 
 
 def test_only_logs_were_recorded_before(run, file):
@@ -263,3 +264,32 @@ def test_only_logs_were_recorded_before(run, file):
     for words in (("watch", "emulated"), ("check",)):
         said = run(*words, "--store", file, "--recorded", "2026-03-02", code=2).stderr
         assert "only logs were recorded before: leave out --recorded" in said
+
+
+# Learned priors.
+
+
+def test_confirmed_faults_count_until_they_are_withdrawn(run, place, store, tmp_path):
+    words = ("--store", place.url, *NAME)
+    sample = ("diagnose", ft.sample_log(), "--json", "found.jsonl", *words)
+    run(*sample, "--recorded", "2026-03-02")
+    run("found", "arm_7", 1, "--confirmed", "--store", place.url)
+    told = run(*sample, "--recorded", "2026-03-02", "--learned-priors")
+    assert "learned priors: 1 confirmed of 1 robot (armpi_fpv) in 0 robot days; most" in told.stderr
+    record = json.loads((tmp_path / "found.jsonl").read_text().splitlines()[0])
+    assert record["method"].endswith("; learned priors")
+    run("advise", "--template", "costs.toml")
+    run("diagnose", ft.sample_log(), "--json", "plain.jsonl")
+    advice = ("advise", "plain.jsonl", "--costs", "costs.toml", "--store", place.url)
+    assert "learned priors: 1 confirmed" in run(*advice, "--learned-priors").stderr
+    run("found", "arm_7", 1, "--withdraw", "--store", place.url)
+    again = run(*sample, "--learned-priors")
+    assert "learned priors: 0 confirmed of 1 robot" in again.stderr
+    watch = ("watch", "emulated", "--speed", 0, "--seconds", 5, "--learned-priors", *words)
+    assert "learned priors: 0 confirmed of 1 robot" in run(*watch).stderr
+
+
+@pytest.mark.parametrize("command", [("diagnose", "a.nc"), ("watch", "emulated")])
+def test_learned_priors_need_a_store(run, command):
+    said = run(*command, "--learned-priors", code=2).stderr
+    assert "--learned-priors needs a store. Name one: --store robots.db." in said

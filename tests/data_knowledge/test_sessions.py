@@ -258,3 +258,23 @@ def test_offsets_with_another_reference_are_left_out(store):
         store.keep_belief("arm_7", Basis("track", None, method), line, given, at(number), [bias])
     (drift,) = store.history("arm_7").drifts
     assert drift.values == (1.0, 2.0)
+
+
+# What a fleet teaches.
+
+
+def test_confirmed_faults_of_a_kind_are_counted_until_they_are_withdrawn(store, armpi):
+    for number in range(4):
+        for day, name in enumerate(("motor_1:stuck", "healthy")):
+            log = LogFile(f"/{number} {day}", f"{number} {day}", 1, at(1440 * day))
+            store.remember([diagnosis("run", name)], f"arm_{number}", log=log, profile=armpi)
+    for number in range(3):
+        store.found(f"arm_{number}", 1, "confirmed")
+    store.found("arm_3", 1, "wrong")
+    seen = store.fleet_faults("armpi_fpv")
+    assert (seen.robots, seen.hours) == (4, pytest.approx(96.0))
+    assert seen.confirmed == {"motor_1:stuck": 3}
+    store.withdraw("arm_0", 1)
+    assert store.fleet_faults("armpi_fpv").confirmed == {"motor_1:stuck": 2}
+    other = store.fleet_faults("ur5e")
+    assert (other.robots, other.hours, other.confirmed) == (0, 0.0, {})

@@ -25,7 +25,7 @@ from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.digital_model.calibrated_robot import GENERIC, CalibratedRobot, HealthyLike
 from failuretwin.digital_model.robot import Robot
-from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser
 from failuretwin.inference.explanation import joint_names_in
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.observation.sensors import TOOL_ALONE
@@ -99,6 +99,29 @@ class Start:
     @property
     def _of_store(self) -> CalibratedRobot | None:
         return None if self.stored is None else self.stored.calibrated
+
+
+def found_in(
+    runs: xr.Dataset,
+    bayes: BayesDiagnoser,
+    diagnoser: Diagnoser,
+    tracking: Tracking | None,
+    start: Start | None,
+) -> Findings:
+    """Return diagnoses of runs.
+
+    Args:
+        runs: The runs.
+        bayes: The Bayesian diagnoser.
+        diagnoser: What diagnoses runs that teach nothing.
+        tracking: What learns run by run; None: nothing does.
+        start: What learning from all runs at once begins with; None: nothing learns so.
+    """
+    if tracking is not None:
+        return tracking.diagnose(runs)
+    if start is not None:
+        return self_calibrated(runs, bayes, start)
+    return Findings(diagnoser.diagnose(runs), bayes)
 
 
 def self_calibrated(runs: xr.Dataset, bayes: BayesDiagnoser, start: Start) -> Findings:

@@ -14,7 +14,7 @@ from failuretwin.app.records import episode_line
 from failuretwin.app.terminal import tell
 from failuretwin.connection.calibration.result import Calibration, calibration_text
 from failuretwin.core.errors import counted
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import concatenate
 from failuretwin.data_knowledge.records.history import FaultEpisode, StoredCalibration
 from failuretwin.data_knowledge.records.log_files import LogFile, log_file
@@ -24,6 +24,7 @@ from failuretwin.data_knowledge.records.sessions import Note
 from failuretwin.data_knowledge.records.store import Remembered, Store
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, calibration_from_table
 from failuretwin.digital_model.robot import Robot
+from failuretwin.inference.diagnoser import BayesDiagnoser
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -92,6 +93,22 @@ class RobotRecord:
             command=command,
             offsets=offsets,
         )
+
+    def fault_factors(self, hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
+        """Return how many times as probable faults are as by the table, and say why.
+
+        The confirmed faults of all robots of the kind in the store tell.
+        """
+        from failuretwin.connection.fault_rates import LearnedRates
+
+        learned = LearnedRates.of(self.store.fleet_faults(self.profile.name), hypotheses)
+        tell(learned.line, err=True)
+        return learned.factors
+
+    def with_learned_priors(self, bayes: BayesDiagnoser) -> BayesDiagnoser:
+        """Return a diagnoser with the priors that the store teaches."""
+        factors = self.fault_factors(bayes.hypothesis_set)
+        return replace(bayes, priors=replace(bayes.priors, fault_factors=factors))
 
     def keeper(self, reading: LogOptions, recorded: datetime | None) -> DiagnosisKeeper:
         """Return what keeps the diagnoses of some logs."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +12,14 @@ import click
 
 import failuretwin as ft
 from failuretwin.app.commands import options as opt
-from failuretwin.app.commands.store import StoreOptions, recorded_option, store_options
+from failuretwin.app.commands.store import (
+    LEARNED,
+    LEARNED_METHOD,
+    StoreOptions,
+    learned_priors_option,
+    recorded_option,
+    store_options,
+)
 from failuretwin.app.terminal import show, tell
 from failuretwin.core.errors import InputError
 
@@ -19,7 +27,7 @@ if TYPE_CHECKING:
     from failuretwin.inference.together.fault_course import FaultCourse
 
 BAYES_ONLY = (
-    *("calibration", "track", "self_calibrate", "hypotheses"),
+    *("calibration", "track", "self_calibrate", "hypotheses", "learned_priors"),
     *("sse_range", "error_range", "onset", "sensing"),
 )
 """Options that only the Bayesian diagnosis has."""
@@ -96,6 +104,7 @@ LEARNING = ("out", "independent")
     "change; `action` never does, nor does a stuck motor.",
 )
 @store_options
+@learned_priors_option
 @recorded_option
 @opt.reading_options
 @opt.plugin_option
@@ -115,6 +124,7 @@ def diagnose(
     csv_file: Path | None,
     report: Path | None,
     correct: Path | None,
+    learned_priors: bool,
     recorded: datetime | None,
     memory: StoreOptions,
     reading: opt.LogOptions,
@@ -145,6 +155,8 @@ def diagnose(
         priors=priors_of(known.robot, sse_range, onset, error_range),
         sensing=sensing,
     )
+    if learned_priors:
+        bayes = memory.needed(stored, LEARNED).with_learned_priors(bayes)
     _refuse_unused(method == given.BAYES, track, self_calibrate)
     diagnoser = given.chosen_diagnoser(method, bayes)
     start = learning.Start(robot.calibration, out, stored)
@@ -154,13 +166,9 @@ def diagnose(
     given.warn_mismatch(runs, given.expected_name(diagnoser))
     if together:
         learning.check_learning_from(sensed)
-    if tracking is not None:
-        found = tracking.diagnose(runs)
-    elif self_calibrate:
-        found = learning.self_calibrated(runs, bayes, start)
-    else:
-        found = learning.Findings(diagnoser.diagnose(runs), bayes)
+    found = learning.found_in(runs, bayes, diagnoser, tracking, start if self_calibrate else None)
     diagnoses = given.with_doubts(found.diagnoses, runs, known.twin)
+    diagnoses = _by_learned_priors(diagnoses) if learned_priors else diagnoses
     if (sse_range or error_range) and diagnoser is bayes:
         usual = priors_of(known.robot, None, onset)
         tell(learning.ruled_out_note(runs, found.bayes, diagnoses, usual), err=True)
@@ -181,6 +189,11 @@ def diagnose(
     show(*([""] if last else []), *last)
     show(*offsets.offset_lines(runs, known, diagnoses, reading, correct))
     show(*remembered)
+
+
+def _by_learned_priors(diagnoses: Sequence[ft.Diagnosis]) -> list[ft.Diagnosis]:
+    """Return diagnoses whose method says that their priors were learned."""
+    return [replace(one, method=f"{one.method}; {LEARNED_METHOD}") for one in diagnoses]
 
 
 def _write(

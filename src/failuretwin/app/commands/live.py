@@ -11,10 +11,15 @@ from typing import TYPE_CHECKING, cast
 import click
 
 from failuretwin.app.commands import options as opt
-from failuretwin.app.commands.store import StoreOptions, recorded_option, store_options
+from failuretwin.app.commands.store import (
+    LEARNED,
+    StoreOptions,
+    learned_priors_option,
+    recorded_option,
+    store_options,
+)
 from failuretwin.app.terminal import console, tell, until_interrupted
 from failuretwin.connection.links import NETWORKS, ROS1
-from failuretwin.core.errors import InputError
 from failuretwin.decision.streaming import STREAMED
 
 if TYPE_CHECKING:
@@ -23,6 +28,7 @@ if TYPE_CHECKING:
     from failuretwin.app.watch_keeper import WatchKeeper
     from failuretwin.connection.links.base import Commander
     from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+    from failuretwin.inference.faults.priors import Priors
 
 
 PROBING = ("idle", "move", *opt.names_of(opt.SafetyOptions))
@@ -61,6 +67,7 @@ PROBING = ("idle", "move", *opt.names_of(opt.SafetyOptions))
 @opt.safety_options
 @opt.live_options
 @store_options
+@learned_priors_option
 @recorded_option
 @opt.plugin_option
 @opt.calibrated_robot_options()
@@ -74,6 +81,7 @@ def watch(
     safety: opt.SafetyOptions,
     live: opt.LiveOptions,
     memory: StoreOptions,
+    learned_priors: bool,
     recorded: datetime | None,
     robot: opt.RobotOptions,
 ) -> None:
@@ -104,9 +112,10 @@ def watch(
     if not probe.probes:
         opt.refuse_unused("nothing is moved without --probe N", *PROBING)
     model, (stored, known) = robot.model, memory.look_up(robot)
-    life = _life(stored) if track else None
+    life = _life(memory.needed(stored, "--track")) if track else None
     resumed = (lambda start: start) if life is None else life.resumed
-    diagnoser = monitor(known.twin, known.imperfections, budget, sensing, resumed)
+    priors = _learned_priors(memory.needed(stored, LEARNED)) if learned_priors else None
+    diagnoser = monitor(known.twin, known.imperfections, budget, sensing, resumed, priors)
     wait_s = load_topics(live.topics).wait_s
     tell(basis_line(known, robot.calibration, budget, "goals" in sensing))
     # An emulated robot ends by itself, a log when it is over.
@@ -137,12 +146,17 @@ def watch(
         tell(f"remembered in {stored.store.name}: watch of {stored.name}")
 
 
-def _life(stored: RobotRecord | None) -> LifeKeeper:
+def _learned_priors(stored: RobotRecord) -> Priors:
+    """Return the priors that the store teaches."""
+    from failuretwin.core.hypothesis import paper_hypotheses
+    from failuretwin.inference.faults.priors import Priors
+
+    considered = paper_hypotheses(stored.profile.motor_names)
+    return Priors(fault_factors=stored.fault_factors(considered))
+
+
+def _life(stored: RobotRecord) -> LifeKeeper:
     """Return what keeps that which the robot teaches from watch to watch."""
-    if stored is None:
-        raise InputError(
-            "--track keeps what the robot teaches in a store. Name one: --store robots.db."
-        )
     from failuretwin.app.life_keeper import LifeKeeper
 
     return LifeKeeper(stored, "watch")

@@ -51,6 +51,16 @@ class StoreOptions:
         stored = None if record is None else record.calibrated
         return record, stored or robot.known
 
+    def needed(self, stored: RobotRecord | None, option: str) -> RobotRecord:
+        """Return the robot in the store, which an option needs.
+
+        Raises:
+            InputError: If there is no store.
+        """
+        if stored is None:
+            raise InputError(f"{option} needs a store. Name one: --store robots.db.")
+        return stored
+
     def record(self, robot: opt.RobotOptions) -> RobotRecord | None:
         """Return the robot in the store; None: nothing is remembered."""
         if not self.store:
@@ -72,6 +82,13 @@ store_options = opt.gathered(
         metavar="NAME",
         help="With --store: name of this very robot. Default: the name of its profile.",
     ),
+)
+LEARNED, LEARNED_METHOD = "--learned-priors", "learned priors"
+"""The option, and what the method of a diagnosis says of it."""
+learned_priors_option = opt.flag_option(
+    LEARNED,
+    "With --store: faults that people confirmed at robots of this kind count more, others less, "
+    "than by the assumed rates.",
 )
 recorded_option = click.option(
     "--recorded",

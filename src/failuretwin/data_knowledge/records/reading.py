@@ -17,7 +17,7 @@ from failuretwin.data_knowledge.records.checking import StoreCheck, checked
 from failuretwin.data_knowledge.records.database import Database
 from failuretwin.data_knowledge.records.export import export_parquet
 from failuretwin.data_knowledge.records.history import History, StoredCalibration, read_history
-from failuretwin.data_knowledge.records.queries import QueryAnswer, ask
+from failuretwin.data_knowledge.records.queries import FleetFaults, QueryAnswer, ask, fleet_faults
 from failuretwin.data_knowledge.records.schema import robots
 from failuretwin.data_knowledge.records.statements import calibration_in_force
 
@@ -85,6 +85,15 @@ class StoreReader:
         """
         with self._database.reading() as connection:
             return ask(connection, name, days)
+
+    def fleet_faults(self, kind: str) -> FleetFaults:
+        """Return the confirmed faults of all robots of a kind, and the time that they were seen.
+
+        Args:
+            kind: Name of their profile.
+        """
+        with self._database.reading() as connection:
+            return fleet_faults(connection, kind)
 
     def export(self, folder: str | Path) -> dict[str, int]:
         """Write every table to ``TABLE.parquet`` in a folder, and return the numbers of rows.

@@ -25,6 +25,7 @@ from failuretwin.decision.streaming.trouble import DEAD, rests_throughout
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import FITS, misfit
 from failuretwin.inference.movements.healthy_density import healthy_log_density
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -295,6 +296,7 @@ def monitor(
     false_alarms_per_100h: float = 1.0,
     sensing: str | None = None,
     resumed: Callable[[LifeFilter], LifeFilter] = lambda start: start,
+    priors: Priors | None = None,
 ) -> FaultMonitor:
     """Return what watches a robot at work: settled poses, and faults are rare.
 
@@ -306,6 +308,7 @@ def monitor(
         sensing: ``tool``, with ``+encoders``, ``+goals`` or both; None: the tool's position alone.
         resumed: Returns what earlier watches have learned of the robot, given what its kind is
             like.
+        priors: Beliefs about faults; None: the usual ones.
     """
-    diagnoser = BayesDiagnoser(twin, imperfections, whole_run=False, sensing=sensing)
+    diagnoser = BayesDiagnoser(twin, imperfections, priors=priors, whole_run=False, sensing=sensing)
     return FaultMonitor(diagnoser, false_alarms_per_100h, resumed)
