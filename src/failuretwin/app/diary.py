@@ -18,23 +18,15 @@ if TYPE_CHECKING:
     from failuretwin.app.remembering import RobotRecord
 
 
-@dataclass(frozen=True)
-class DiaryLine:
-    """A line of a diary: when (UTC), and a sentence."""
-
-    at: datetime
-    text: str
-
-
 @dataclass
 class Diary:
     """Lines about the work of an arm, in their order; calling it tells one.
 
     Attributes:
-        lines: The lines so far.
+        lines: The lines so far: when (UTC), and a sentence.
     """
 
-    lines: list[DiaryLine] = field(default_factory=list)
+    lines: list[tuple[datetime, str]] = field(default_factory=list)
 
     def __call__(self, text: str) -> None:
         """Tell a line and note it."""
@@ -43,7 +35,7 @@ class Diary:
 
     def note(self, *texts: str) -> None:
         """Note lines."""
-        self.lines += [DiaryLine(datetime.now(UTC), text) for text in texts]
+        self.lines += [(datetime.now(UTC), text) for text in texts]
 
 
 @contextmanager

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from failuretwin.app.commands.options import LogOptions
-    from failuretwin.app.diary import DiaryLine
     from failuretwin.decision.test_motions.health_check import CheckResult
 
 
@@ -115,13 +114,17 @@ class RobotRecord:
         return DiagnosisKeeper(self, reading, recorded)
 
     def remember_work(
-        self, command: str, known: CalibratedRobot, method: str, lines: Sequence[DiaryLine]
+        self,
+        command: str,
+        known: CalibratedRobot,
+        method: str,
+        lines: Sequence[tuple[datetime, str]],
     ) -> str:
         """Store what a command did with the arm, and why; return what was stored, in a line."""
         figures = known.imperfections
         method = f"{method}; healthy behaviour: {figures.name}"
         basis = Basis(command, self.calibration_number, method, figures.protocol)
-        notes = [Note(line.at, line.text) for line in lines]
+        notes = [Note(at, text) for at, text in lines]
         self.store.begin(self.name, basis, *notes, profile=self.profile)
         return f"remembered in {self.store.name}: {command} of {self.name}"
 
