@@ -1,280 +1,288 @@
-"""Sessions, offsets and beliefs in the store, on SQLite and PostgreSQL."""
-
 from __future__ import annotations
 
-import os
-import signal
-import time
-from datetime import UTC, datetime, timedelta
+import dataclasses
+import shutil
 
 import numpy as np
 import pytest
 
-import failuretwin as ft
-from failuretwin.core.errors import InputError, OutputError
-from failuretwin.data_knowledge.records import beliefs
-from failuretwin.data_knowledge.records.beliefs import Belief, BeliefLine
-from failuretwin.data_knowledge.records.log_files import LogFile
-from failuretwin.data_knowledge.records.offsets import MotorOffset
-from failuretwin.data_knowledge.records.rows import Basis
-from failuretwin.data_knowledge.records.sessions import Note
-from store_places import diagnosis
+from failuretwin import ReadOptions, read_runs
+from failuretwin.core.errors import InputError
+from failuretwin.data_knowledge.readers.raw_sessions import (
+    SESSION_FILES,
+    find_sessions,
+    read_session,
+)
 
-START = datetime(2026, 3, 2, tzinfo=UTC)
-HEALTHY = diagnosis("stream", "healthy")
-STUCK = diagnosis("stream", "motor_1:stuck")
+COMMAND, DURATION, POSITION = SESSION_FILES
 
 
-def at(minutes):
-    return START + timedelta(minutes=minutes)
+def edit(path, change):
+    path.write_text(change(path.read_text()))
 
 
-@pytest.fixture
-def store(place):
-    return ft.open_store(place.url, create=True)
+def edit_cell(path, row, column, text):
+    """Replace what stands in a 0-based data row under a column name."""
+    lines = path.read_text().splitlines()
+    cells = lines[row + 1].split(",")
+    cells[lines[0].split(",").index(column)] = text
+    lines[row + 1] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
 
 
-def watch(store, robot="arm_7", minutes=0):
-    """Begin the session of a watch."""
-    log = LogFile("ros1", None, 0, at(minutes))
-    note = Note(at(minutes), "begins: ros1")
-    return store.begin(robot, Basis("watch", None, "watch"), note, log=log, runs=["watch"])
+def seen(runs, run=0):
+    return np.flatnonzero(np.isfinite(runs["measured"].values[run]).all(axis=1))
 
 
-def told(history):
-    return [(one.kind, one.text) for one in history.timeline]
+def test_session_with_known_motion_comes_back(session, armpi, tool_at):
+    runs = read_runs(session.write(), armpi)
 
-
-def test_a_watch_is_stored_as_it_happens(store, place):
-    session = watch(store)
-    assert told(store.history("arm_7")) == [("watch", "begins: ros1")]
-    session.note(Note(at(1), "OK: healthy", HEALTHY, ""))
-    (raised,) = session.note(Note(at(2), "ALARM: stuck", STUCK, "motor_1:stuck"))
-    assert (raised.motor, raised.mode, raised.state) == ("motor_1", "stuck", "raised")
-    (cleared,) = session.note(Note(at(3), "CLEARED: stuck", HEALTHY, ""))
-    assert (cleared.number, cleared.state, cleared.until) == (1, "cleared", at(3))
-    session.note(Note(at(4), "ends: OK", HEALTHY, final=True))
-    found = store.history("arm_7")
-    assert told(found) == [
-        ("watch", "begins: ros1"),
-        ("watch", "OK: healthy"),
-        ("watch", "ALARM: stuck"),
-        ("episode", "episode 1 begins: motor_1 stuck"),
-        ("watch", "CLEARED: stuck"),
-        ("episode", "episode 1 cleared"),
-        ("watch", "ends: OK"),
-    ]
-    assert (found.counts, found.recent) == ({}, ())
-    events = place.sql(
-        "SELECT episode_events.state, verdict FROM episode_events JOIN diagnoses "
-        "ON diagnosis_id = diagnoses.id ORDER BY episode_events.id"
+    # The last reading before the first command is at -0.05 s: that is t = 0 of the run.
+    readings = session.reading_time[session.reading_time > -0.06]
+    samples = np.rint((readings + 0.05) / 0.01).astype(int)
+    np.testing.assert_array_equal(seen(runs), samples)
+    np.testing.assert_allclose(
+        runs["measured"].values[0, samples], tool_at(session.counts(readings)), rtol=0, atol=1e-9
     )
-    assert events == [("raised", "motor_1:stuck for sure"), ("cleared", "healthy for sure")]
-    assert place.sql("SELECT command, method FROM sessions") == [("watch", "watch")]
-
-
-def test_a_suspicion_is_noted_and_begins_no_episode(store):
-    session = watch(store)
-    session.note(Note(at(1), "SUSPECTED: stuck", diagnosis("stream", "motor_1:stuck", 0.3), ""))
-    found = store.history("arm_7")
-    assert found.episodes == ()
-    assert told(found)[-1] == ("watch", "SUSPECTED: stuck")
-
-
-def test_an_alarm_clears_only_what_it_has_named(store):
-    """A fault of another motor stays open until a whole run is healthy."""
-    store.remember([diagnosis("run", "motor_2:stuck")], "arm_7", log=LogFile("a", "f", 1, at(0)))
-    session = watch(store, minutes=1)
-    session.note(Note(at(2), "OK", HEALTHY, ""))
-    session.note(Note(at(3), "ALARM", STUCK, "motor_1:stuck"))
-    session.note(Note(at(4), "CLEARED", HEALTHY, ""))
-    assert [one.motor for one in store.history("arm_7").open_episodes] == ["motor_2"]
-    session.note(Note(at(5), "ends", HEALTHY, final=True))
-    assert store.history("arm_7").open_episodes == []
-
-
-def test_an_alarm_that_names_another_fault_begins_another_episode(store):
-    session = watch(store)
-    session.note(
-        Note(at(1), "ALARM", STUCK, "motor_1:stuck"),
-        Note(at(2), "ALARM", STUCK, "motor_2:stuck"),
+    np.testing.assert_allclose(
+        runs["movement_start"].values[0], session.command_time + 0.05, atol=1e-5
     )
-    states = [(one.motor, one.state) for one in store.history("arm_7").episodes]
-    assert states == [("motor_1", "cleared"), ("motor_2", "raised")]
+    np.testing.assert_allclose(
+        runs["target"].values[0], np.deg2rad(120 - 0.24 * session.targets), atol=1e-12
+    )
+    np.testing.assert_allclose(runs["ramp_duration"].values, 0.8)
+    assert runs["run"].values.tolist() == ["session/run_01"]
+    assert runs.attrs["robot"] == "armpi_fpv"
+    assert runs.attrs["measured_rate_hz"] == 10.0
 
 
-def test_a_watch_goes_on_with_the_episode_that_one_before_it_left_open(store):
-    watch(store).note(Note(at(1), "ALARM", STUCK, "motor_1:stuck"))  # and is killed
-    again = watch(store, minutes=2)
-    again.note(Note(at(3), "ALARM", STUCK, "motor_1:stuck"))
-    again.note(Note(at(4), "CLEARED", HEALTHY, ""))
-    states = [(one.since, one.until) for one in store.history("arm_7").episodes]
-    assert states == [(at(1), at(4))]
+def test_command_is_a_ramp_to_the_target_then_holds(session, armpi):
+    runs = read_runs(session.write(), armpi)
+    time = runs["time"].values - 0.05
+    corners = np.ravel([session.command_time, session.command_time + 0.8], order="F")
+    values = np.repeat(np.vstack([[500.0] * 4, session.targets]), 2, axis=0)[1:-1]
+    expected = np.stack([np.interp(time, corners, v) for v in values.T], axis=-1)
+    np.testing.assert_allclose(
+        runs["command"].values[0], np.deg2rad(120 - 0.24 * expected), rtol=0, atol=1e-5
+    )
 
 
-def test_a_log_that_is_replayed_later_changes_no_episode(store):
-    store.remember([diagnosis("run", "healthy")], "arm_7", log=LogFile("a", "f", 1, at(60)))
-    watch(store).note(Note(at(1), "ALARM", STUCK, "motor_1:stuck"))
-    assert store.history("arm_7").episodes == ()
+@pytest.mark.parametrize("value", [-1.0, 1001.0, 32447.0, -32503.0])
+def test_readings_out_of_range_are_missing(session, armpi, value):
+    whole = read_runs(session.write("whole"), armpi)
+    spoilt = read_runs(session.write("spoilt", counts={30: [500, 500, value, 500]}), armpi)
+    lost = np.setdiff1d(seen(whole), seen(spoilt))
+    assert lost.tolist() == [250]
+    assert np.setdiff1d(seen(spoilt), seen(whole)).size == 0
 
 
-def test_kills_at_any_time_leave_whole_notes_and_all_that_was_told(place, store):
-    for number, delay in enumerate((0.0, 0.01, 0.03, 0.06, 0.1, 0.2)):
-        acknowledged, out = os.pipe()
-        child = os.fork()
-        if child == 0:
-            session = watch(ft.open_store(place.url), f"arm {number}")
-            for turn in range(1000):
-                text, cause = ("ALARM", "motor_1:stuck") if turn % 2 else ("OK", "")
-                session.note(Note(at(turn + 1), text, STUCK, cause))
-                os.write(out, b".")
-            os._exit(0)
-        os.close(out)
-        assert os.read(acknowledged, 1) == b"."
-        time.sleep(delay)
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        with os.fdopen(acknowledged, "rb") as pipe:
-            said = 1 + len(pipe.read())
-        of = f"JOIN robots ON robots.id = robot_id WHERE name = 'arm {number}'"
-        ((notes,),) = place.sql(f"SELECT count(*) - 1 FROM notes {of}")
-        ((known,),) = place.sql(f"SELECT count(*) FROM diagnoses {of}")
-        ((raised,),) = place.sql(f"SELECT count(*) FROM episodes {of}")
-        assert said <= int(notes) == int(known) <= said + 1
-        assert int(raised) == int(notes) // 2
-    assert store.check().problems == ()
+def test_glitches_of_the_gripper_do_not_matter(session, armpi):
+    whole, spoilt = session.write("whole"), session.write("spoilt")
+    edit_cell(spoilt / POSITION, 30, "motor_1", "32447.0")
+    edit_cell(spoilt / POSITION, 31, "motor_2", "-1.0")
+    paths = [read_runs(folder, armpi)["measured"] for folder in (whole, spoilt)]
+    np.testing.assert_array_equal(*paths)
 
 
-def test_work_is_a_session_without_diagnoses(store, place):
-    notes = [Note(at(k), f"target {k}: reached") for k in range(3)]
-    store.begin("arm_7", Basis("act", None, "diagnose"), *notes)
-    assert told(store.history("arm_7")) == [("act", f"target {k}: reached") for k in range(3)]
-    assert store.history("arm_7").health == "no open fault"
+def test_the_reading_before_a_gap_is_missing_too(session, armpi):
+    whole = read_runs(session.write("whole"), armpi)
+    gappy = read_runs(session.write("gappy", gap=(31, 61)), armpi)
+    lost = np.setdiff1d(seen(whole), seen(gappy))
+    np.testing.assert_array_equal(lost, np.arange(30, 61) * 10 - 50)
 
 
-def test_registered_runs_are_not_known_before_they_are_diagnosed(store, place):
-    """Their first diagnosis begins episodes as that of any run."""
-    log = LogFile("/out.nc", "f00", 9, at(0))
-    note = Note(at(0), "2 runs written to out.nc")
-    store.begin("arm_7", Basis("import"), note, log=log, runs=["a", "b"])
-    assert place.sql("SELECT name FROM runs ORDER BY id") == [("a",), ("b",)]
-    assert told(store.history("arm_7")) == [("import", "2 runs written to out.nc")]
-    given = [diagnosis("a", "motor_1:stuck"), diagnosis("b", "motor_1:stuck")]
-    assert store.remember(given, "arm_7", log=log).added == 2
-    assert place.sql("SELECT count(*) FROM runs") == [("2",)]
-    assert [one.state for one in store.history("arm_7").episodes] == ["raised"]
+def test_a_pause_below_half_a_second_is_no_gap(session, armpi):
+    whole = read_runs(session.write("whole"), armpi)
+    pause = read_runs(session.write("pause", gap=(31, 34)), armpi)
+    lost = np.setdiff1d(seen(whole), seen(pause))
+    np.testing.assert_array_equal(lost, np.arange(31, 34) * 10 - 50)
 
 
-def test_a_check_is_stored_with_its_zeros(store, place):
-    zero = MotorOffset("motor_1", "zero", 0.125, 0.0625, "rad")
-    told_of = diagnosis("check", "healthy")
-    log = LogFile("", None, 0, at(0))
-    store.remember([told_of], "arm_7", log=log, command="check", offsets=[zero])
-    rows = place.sql("SELECT motor, name, value, deviation, unit FROM offsets")
-    assert rows == [("motor_1", "zero", "0.125", "0.0625", "rad")]
-    assert told(store.history("arm_7")) == [("check", "check: healthy for sure")]
+def test_columns_are_found_by_name(session, armpi):
+    plain, shuffled = session.write("plain"), session.write("shuffled")
+    for name in SESSION_FILES:
+        rows = [line.split(",") for line in (shuffled / name).read_text().splitlines()]
+        order = [4, 0, 6, 1, 5, 2, 3]
+        (shuffled / name).write_text("\n".join(",".join(r[i] for i in order) for r in rows) + "\n")
+    runs = [read_runs(folder, armpi) for folder in (plain, shuffled)]
+    assert runs[0].drop_vars("run").identical(runs[1].drop_vars("run"))
 
 
-# Beliefs.
-
-LINE = BeliefLine("diagnose", "start")
-
-
-def belief(number, after=None):
-    rng = np.random.default_rng(number)
-    arrays = {"mean": rng.normal(size=(2, 3)), "counted": rng.random(4) > 0.5, "alarm": "ö x"}
-    arrays = {name: np.asarray(value) for name, value in arrays.items()}
-    return Belief(number, arrays, [{"key": f"run {number}"}], after)
+def test_the_robots_clock_does_not_matter(session, armpi):
+    now = read_runs(session.write("now"), armpi)
+    session.epoch = 0.0
+    then = read_runs(session.write("then"), armpi)
+    np.testing.assert_array_equal(seen(now)[:-1], seen(then)[:-1])
+    np.testing.assert_allclose(now["command"][:, :999], then["command"][:, :999], atol=1e-5)
 
 
-def keep(store, given, line=LINE):
-    store.keep_belief("arm_7", Basis("track"), line, given, at(given.runs))
+def test_home_and_repeat_rows_belong_to_no_run(session, armpi):
+    rng = np.random.default_rng(1)
+    blocks = []
+    for _ in range(3):
+        moves = rng.integers(300, 700, (5, 4)).astype(float)
+        blocks += [np.full((1, 4), 500.0), moves, moves[-1:]]
+    session.targets, session.until_s = np.concatenate(blocks), 44.0
+
+    runs = read_runs(session.write(), armpi)
+
+    assert runs["run"].values.tolist() == [f"session/run_{i:02d}" for i in (1, 2, 3)]
+    for run in range(3):
+        moves = session.targets[7 * run + 1 : 7 * run + 6]
+        np.testing.assert_allclose(runs["target"].values[run], np.deg2rad(120 - 0.24 * moves))
+        np.testing.assert_allclose(runs["command"].values[run, 0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(runs["duration"], 10.05, atol=0.011)
 
 
-def test_a_belief_comes_back_digit_for_digit_and_is_never_overwritten(store, place):
-    assert store.belief("arm_7", LINE) == (None, "")
-    after = None
-    for number in (1, 2, 3):
-        keep(store, belief(number, after))
-        found, unused = store.belief("arm_7", LINE)
-        assert unused == ""
-        after = found.number
-    assert found.runs == 3
-    assert [row["key"] for row in found.rows] == ["run 1", "run 2", "run 3"]
-    for name, array in belief(3).arrays.items():
-        np.testing.assert_array_equal(found.arrays[name], array)
-        assert found.arrays[name].dtype == array.dtype
-    assert place.sql("SELECT count(*) FROM beliefs") == [("3",)]
+def test_published_form_fills_gaps_by_straight_lines(session, armpi, tool_at):
+    folder = session.write(gap=(31, 61), counts={70: [1200, 500, 500, 500]})
+    runs = read_runs(folder, armpi, ReadOptions("published"))
+
+    assert runs.sizes["time"] == 1000
+    assert np.isfinite(runs["measured"]).all()
+    kept = np.r_[0:31, 61 : len(session.reading_time)]
+    counts = session.counts(session.reading_time)
+    counts[70] = [1200, 500, 500, 500]
+    time = np.linspace(0, 10, 1000) - 0.05
+    filled = [np.interp(time, session.reading_time[kept], c) for c in counts[kept].T]
+    expected = tool_at(np.clip(np.stack(filled, axis=-1), 0, 1000))
+    np.testing.assert_allclose(runs["measured"].values[0], expected, rtol=0, atol=1e-6)
 
 
-def test_two_that_go_on_from_the_same_belief_are_not_mixed(store, place):
-    keep(store, belief(1))
-    with pytest.raises(OutputError, match=r"another session has followed.*Run the command again"):
-        keep(store, belief(2))
-    assert place.sql("SELECT count(*) FROM beliefs") == [("1",)]
-    assert place.sql("SELECT count(*) FROM sessions") == [("1",)]
+def test_log_that_ends_early_is_read_as_far_as_it_goes(session, armpi):
+    session.until_s = 5.0
+    runs = read_runs(session.write(), armpi)
+    assert runs["duration"].values[0] == pytest.approx(5.0, abs=0.011)
 
 
-def test_a_belief_of_another_start_or_version_is_not_used(store, monkeypatch):
-    keep(store, belief(1))
-    other = BeliefLine("diagnose", "another")
-    assert store.belief("arm_7", other) == (None, "it began with another calibration")
-    assert store.belief("arm_7", BeliefLine("watch", "start")) == (None, "")
-    monkeypatch.setattr(beliefs, "__version__", "9.9")
-    found, unused = store.belief("arm_7", LINE)
-    assert found is None
-    assert unused == f"failuretwin {ft.__version__} made it, and this is 9.9"
+def test_published_form_ends_with_the_log(session, armpi):
+    """Lines are drawn between readings; after the last one nothing is known."""
+    session.until_s = 5.0
+    runs = read_runs(session.write(), armpi, ReadOptions("published"))
+    assert not np.isfinite(runs["measured"].values[0, runs["time"] > 5.05]).any()
 
 
-def test_a_damaged_belief_gives_one_line(store, monkeypatch):
-    monkeypatch.setattr(beliefs, "_packed", lambda arrays: b"nothing")
-    keep(store, belief(1))
-    with pytest.raises(InputError, match=r"damaged.*Restore the store from a copy"):
-        store.belief("arm_7", LINE)
+@pytest.mark.parametrize("until_s", [-0.1, 0.3, 0.75])
+@pytest.mark.parametrize("how", ["measured", "published"])
+def test_log_that_ends_before_the_first_movement_does_is_refused(session, armpi, until_s, how):
+    session.until_s = until_s
+    with pytest.raises(InputError, match=r"readings end before .* one whole movement"):
+        read_runs(session.write(), armpi, ReadOptions(how))
 
 
-# Wear.
+def test_sessions_are_found_downwards_in_order(session):
+    for name in ("b/2", "a", "b/1"):
+        session.write(name)
+    (session.folder / "empty").mkdir()
+    found = find_sessions(session.folder)
+    assert [str(path.relative_to(session.folder)) for path in found] == ["a", "b/1", "b/2"]
+    assert find_sessions(session.folder / "a") == [session.folder / "a"]
+    assert find_sessions(session.folder / "empty") == []
 
 
-def test_the_history_shows_how_offsets_drift(store):
-    for number in range(101):
-        zero = MotorOffset("motor_1", "zero", 0.01 * number, 0.002, "rad")
-        log = LogFile("", None, 0, at(number))
-        told_of = [diagnosis(f"check {number}", "healthy")]
-        store.remember(told_of, "arm_7", log=log, command="check", offsets=[zero])
-    (drift,) = store.history("arm_7").drifts
-    assert (drift.motor, drift.name, drift.unit) == ("motor_1", "zero", "rad")
-    assert drift.change == pytest.approx(1.0)
-    assert len(drift.at) == 20
-    assert (drift.at[0], drift.at[-1]) == (at(0), at(100))
-    assert sorted(drift.values) == list(drift.values)
+def test_all_sessions_below_a_folder_become_one_run_set(session, armpi):
+    for name in ("x/one", "y/one", "y/two"):
+        session.write(name)
+    runs = read_runs([session.folder / "x", str(session.folder / "y")], armpi)
+    assert runs["run"].values.tolist() == ["one/run_01", "one/run_01#2", "two/run_01"]
 
 
-def test_offsets_with_another_reference_are_left_out(store):
-    for number, method in enumerate(("old", "new", "new")):
-        bias = MotorOffset("motor_1", "bias", float(number), 0.002, "rad")
-        line = BeliefLine("diagnose", method)
-        given = belief(1, None if number < 2 else 2)
-        store.keep_belief("arm_7", Basis("track", None, method), line, given, at(number), [bias])
-    (drift,) = store.history("arm_7").drifts
-    assert drift.values == (1.0, 2.0)
+@pytest.mark.parametrize("missing", SESSION_FILES)
+def test_incomplete_session_names_the_missing_file(session, missing):
+    folder = session.write()
+    (folder / missing).unlink()
+    with pytest.raises(InputError, match=rf"needs three files.*; missing: {missing}\."):
+        find_sessions(session.folder)
 
 
-# What a fleet teaches.
+@pytest.mark.parametrize("file", SESSION_FILES)
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: "", "is empty"),
+        (lambda text: text.splitlines()[0] + "\n", "has a header but no rows"),
+        (lambda text: text.replace("motor_6", "motor6"), "'motor_6'. Did you mean 'motor6'"),
+        (lambda text: text.replace("timestamp", "stamp"), "unknown column 'timestamp'"),
+        (lambda text: text.replace("motor_2", "motor_6"), "motor_6"),
+    ],
+    ids=["empty", "no rows", "no motor_6", "no timestamp", "motor_6 twice"],
+)
+def test_unusable_table_is_named(session, armpi, file, change, message):
+    folder = session.write()
+    edit(folder / file, change)
+    with pytest.raises(InputError) as error:
+        read_session(folder, armpi)
+    assert str(folder / file) in str(error.value)
+    assert message in str(error.value)
 
 
-def test_confirmed_faults_of_a_kind_are_counted_until_they_are_withdrawn(store, armpi):
-    for number in range(4):
-        for day, name in enumerate(("motor_1:stuck", "healthy")):
-            log = LogFile(f"/{number} {day}", f"{number} {day}", 1, at(1440 * day))
-            store.remember([diagnosis("run", name)], f"arm_{number}", log=log, profile=armpi)
-    for number in range(3):
-        store.found(f"arm_{number}", 1, "confirmed")
-    store.found("arm_3", 1, "wrong")
-    seen = store.fleet_faults("armpi_fpv")
-    assert (seen.robots, seen.hours) == (4, pytest.approx(96.0))
-    assert seen.confirmed == {"motor_1:stuck": 3}
-    store.withdraw("arm_0", 1)
-    assert store.fleet_faults("armpi_fpv").confirmed == {"motor_1:stuck": 2}
-    other = store.fleet_faults("ur5e")
-    assert (other.robots, other.hours, other.confirmed) == (0, 0.0, {})
+@pytest.mark.parametrize("text", ["fast", "", "nan", "inf"])
+@pytest.mark.parametrize("file", SESSION_FILES)
+def test_cell_that_is_no_number_is_pointed_at(session, armpi, file, text):
+    folder = session.write()
+    edit_cell(folder / file, 2, "motor_4", text)
+    with pytest.raises(InputError, match=rf"{file}: line 4, column motor_4: .*expected a number"):
+        read_session(folder, armpi)
+
+
+@pytest.mark.parametrize("stamp", ["1699999999.0", "1700000002.0"])
+def test_time_that_does_not_run_forwards_is_pointed_at(session, armpi, stamp):
+    folder = session.write()
+    edit_cell(folder / COMMAND, 2, "timestamp", stamp)
+    with pytest.raises(InputError, match=r"cmd\.csv: time runs backwards .* at line 4 "):
+        read_session(folder, armpi)
+
+
+def test_durations_must_match_the_commands(session, armpi):
+    folder = session.write()
+    edit(folder / DURATION, lambda text: "\n".join(text.splitlines()[:-1]) + "\n")
+    with pytest.raises(InputError, match=r"has 5 rows and .* 4\. Expected a duration"):
+        read_session(folder, armpi)
+
+
+def test_a_log_of_glitches_alone_is_refused(session, armpi):
+    everything = range(len(session.reading_time))
+    folder = session.write(counts={row: [500, 500, 500, 32000] for row in everything})
+    with pytest.raises(InputError, match=r"no reading lies within the servo's range of 0 to 1000"):
+        read_session(folder, armpi)
+
+
+def test_published_labels_need_folder_names_that_say_so(session, armpi):
+    folder = session.write("20240101_label_3")
+    options = ReadOptions(published_labels=True)
+    assert read_runs(folder, armpi, options)["fault"].values.tolist() == ["motor_3:stuck"]
+    other = session.write("label_9")
+    with pytest.raises(InputError, match=r"_label_0 to _label_8; this one is 'label_9'"):
+        read_runs(other, armpi, options)
+
+
+def test_robot_without_log_columns_cannot_read_sessions(session, armpi):
+    motors = tuple(dataclasses.replace(motor, log_column="") for motor in armpi.motors)
+    robot = dataclasses.replace(armpi, profile=dataclasses.replace(armpi.profile, motors=motors))
+    with pytest.raises(InputError, match="no log_column"):
+        read_session(session.write(), robot)
+
+
+@pytest.mark.parametrize("name", ["nothing", "nothing.nc"])
+def test_source_that_does_not_exist_is_named(tmp_path, armpi, name):
+    with pytest.raises(InputError, match=rf"{name}: does not exist"):
+        read_runs(tmp_path / name, armpi)
+
+
+def test_folder_without_sessions_says_what_a_session_is(tmp_path, armpi):
+    with pytest.raises(InputError, match=f"no raw session.*{COMMAND}"):
+        read_runs(tmp_path, armpi)
+
+
+def test_no_sources_are_refused(armpi):
+    with pytest.raises(InputError, match="Expected"):
+        read_runs([], armpi)
+
+
+def test_reading_changes_no_file(session, armpi):
+    folder = session.write()
+    copy = shutil.copytree(folder, session.folder / "copy")
+    read_runs(folder, armpi)
+    for name in SESSION_FILES:
+        assert (folder / name).read_bytes() == (copy / name).read_bytes()
+    assert sorted(path.name for path in folder.iterdir()) == sorted(SESSION_FILES)
