@@ -11,8 +11,10 @@ import sys
 import tempfile
 import threading
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
@@ -23,11 +25,16 @@ from hypothesis import strategies as st
 import failuretwin as ft
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.data_knowledge.records import migrations
+from failuretwin.data_knowledge.records.beliefs import Belief, BeliefLine
 from failuretwin.data_knowledge.records.database import Database
+from failuretwin.data_knowledge.records.offsets import MotorOffset
+from failuretwin.data_knowledge.records.rows import Basis
 from failuretwin.data_knowledge.records.schema import CLOSES, metadata
+from failuretwin.data_knowledge.records.sessions import Note
 from full_disks import full_disk
 from store_places import diagnosis
 
+NOW = datetime(2026, 3, 2, tzinfo=UTC)
 TABLES = [table.name for table in metadata.sorted_tables]
 
 
@@ -70,7 +77,9 @@ ROWS = {
     "logs": f"(1, 1, '/a.csv', 'f00', 9, {DAY}, {DAY})",
     "runs": """(1, 1, 0, 'run', '{"duration_s": 9.0}')""",
     "calibrations": f"(1, 1, 'c', 'P0c', 'x = 1', 'f00', '0.1.0', {DAY}, NULL)",
-    "sessions": f"(1, 1, 1, {DAY}, '0.1.0', 'bayes', 'P0c')",
+    "sessions (id, robot_id, calibration_id, begun, version, method, protocol)": (
+        f"(1, 1, 1, {DAY}, '0.1.0', 'bayes', 'P0c')"
+    ),
     "episodes": f"(1, 1, 1, 'motor_1', 'stuck', {DAY}, NULL)",
 }
 """Rows as revision 1 of the schema held them."""
@@ -81,16 +90,21 @@ def test_a_store_of_every_revision_is_brought_up_to_date_with_its_data(place, re
     make_old(place, revision)
     for table, row in ROWS.items():
         place.sql(f"INSERT INTO {table} VALUES {row}")
-    before = contents(place)
+    before = counts(place, ROWS)
     if revision != migrations.HEAD:
         with pytest.raises(InputError, match=rf"revision {revision}, expected .* store upgrade"):
             ft.open_store(place.url)
     assert Database(place.url).upgrade() == (revision, migrations.HEAD)
-    assert contents(place) == before
+    assert counts(place, ROWS) == before == [(table, 1) for table in ROWS]
     found = ft.open_store(place.url).history("arm_7")
     assert (found.episodes[0].state, found.calibrations[0].document) == ("suspected", "x = 1")
     with pytest.raises(Exception, match="append-only"):
         refused(place, "DELETE FROM robots")
+
+
+def counts(place, tables):
+    """Return the number of rows of each table."""
+    return [(name, len(place.sql(f"SELECT * FROM {name.split()[0]}"))) for name in tables]
 
 
 def refused(place, statement):
@@ -145,6 +159,10 @@ def full_place(place, store, armpi):
     store.remember([diagnosis("run", "motor_1:stuck")], "arm_7", calibration=kept.number)
     store.found("arm_7", 1, "confirmed")
     store.repaired("arm_7", "motor_1")
+    store.begin("arm_7", Basis("act"), Note(NOW, "target 1: reached"))
+    zero = MotorOffset("motor_1", "zero", 0.1, 0.01, "rad")
+    belief = Belief(1, {"mean": np.arange(3.0)}, [{"key": "a"}])
+    store.keep_belief("arm_7", Basis("track"), BeliefLine("diagnose", "cold"), belief, NOW, [zero])
     assert all(contents(place).values())
     return place
 

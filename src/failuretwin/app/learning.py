@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,11 +15,17 @@ from failuretwin.app.terminal import progress_bar
 from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
 from failuretwin.connection.life_history import History, keep_history, open_history
 from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser, learned_name
-from failuretwin.connection.tracked_diagnosis import begin, calibration_of, diagnose_tracked
+from failuretwin.connection.tracked_diagnosis import (
+    Tracked,
+    begin,
+    calibration_of,
+    diagnose_tracked,
+)
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.digital_model.calibrated_robot import GENERIC
-from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.digital_model.calibrated_robot import GENERIC, CalibratedRobot, HealthyLike
+from failuretwin.digital_model.robot import Robot
+from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser
 from failuretwin.inference.explanation import joint_names_in
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.observation.sensors import TOOL_ALONE
@@ -25,6 +33,9 @@ from failuretwin.inference.together.folder_posterior import PASSES
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from failuretwin.app.life_keeper import LifeKeeper
+    from failuretwin.app.remembering import RobotRecord
 
 SURE = 0.9
 """Probability from which a run that would look otherwise is reported."""
@@ -40,7 +51,7 @@ class Findings:
         remarks: Remarks on the robot.
         lines: Lines on the learned robot.
         sections: The same as sections of a page.
-        keep: Writes what was learned run by run.
+        keep: Writes what was learned run by run, given when the last was (UTC; None: now).
     """
 
     diagnoses: Sequence[Diagnosis]
@@ -48,7 +59,7 @@ class Findings:
     remarks: tuple[str, ...] = ()
     lines: Sequence[str] = ()
     sections: Sequence[Section] = ()
-    keep: Callable[[], None] = lambda: None
+    keep: Callable[[datetime | None], None] = lambda at: None
 
 
 def check_learning_from(sensed: Sequence[str]) -> None:
@@ -61,21 +72,71 @@ def check_learning_from(sensed: Sequence[str]) -> None:
         )
 
 
-def self_calibrated(
-    runs: xr.Dataset, bayes: BayesDiagnoser, calibration: Path | None, out: Path | None
+@dataclass(frozen=True)
+class Start:
+    """What learning begins with, and where its result goes.
+
+    Attributes:
+        calibration: Calibration that is named; None: none is.
+        out: Calibration to write; None: none.
+        stored: The robot in the store, maybe with a calibration; None: there is no store.
+    """
+
+    calibration: Path | None
+    out: Path | None
+    stored: RobotRecord | None
+
+    @property
+    def cold(self) -> bool:
+        """Whether nothing is known of this robot but its kind."""
+        return self._of_store is None and self.calibration in (None, Path(GENERIC))
+
+    @property
+    def figures(self) -> HealthyLike:
+        """The calibration; None: what arms of its class are like."""
+        return self.calibration if self._of_store is None else self._of_store.imperfections
+
+    @property
+    def _of_store(self) -> CalibratedRobot | None:
+        return None if self.stored is None else self.stored.calibrated
+
+
+def found_in(
+    runs: xr.Dataset,
+    bayes: BayesDiagnoser,
+    diagnoser: Diagnoser,
+    tracking: Tracking | None,
+    start: Start | None,
 ) -> Findings:
-    """Return diagnoses that learn the robot from all runs at once; the calibration goes to `out`.
+    """Return diagnoses of runs.
+
+    Args:
+        runs: The runs.
+        bayes: The Bayesian diagnoser.
+        diagnoser: What diagnoses runs that teach nothing.
+        tracking: What learns run by run; None: nothing does.
+        start: What learning from all runs at once begins with; None: nothing learns so.
+    """
+    if tracking is not None:
+        return tracking.diagnose(runs)
+    if start is not None:
+        return self_calibrated(runs, bayes, start)
+    return Findings(diagnoser.diagnose(runs), bayes)
+
+
+def self_calibrated(runs: xr.Dataset, bayes: BayesDiagnoser, start: Start) -> Findings:
+    """Return diagnoses that learn the robot from all runs at once.
 
     Raises:
         InputError: If nothing can be learned.
         OutputError: If the calibration cannot be written.
     """
-    robot = bayes.twin.robot
+    robot, out, calibration = bayes.twin.robot, start.out, start.calibration
     if out is not None:
         begun = calibration is not None and calibration.resolve() == out.resolve()
         given = bayes.healthy_model.imperfections.name
         check_calibration_file(out, robot, given if begun else learned_name(robot))
-    together = SelfCalibratingDiagnoser(robot, calibration, bayes.hypotheses, bayes.priors)
+    together = SelfCalibratingDiagnoser(robot, start.figures, bayes.hypotheses, bayes.priors)
     with progress_bar("self-calibrating", PASSES) as advance:
         learned = together.learn(runs, advance)
     if out is not None:
@@ -90,40 +151,68 @@ def self_calibrated(
     )
 
 
-def opened_history(bayes: BayesDiagnoser, calibration: Path | None, out: Path | None) -> History:
-    """Return the history of a robot, beside its calibration, or beside `out` if it has none.
+class Tracking:
+    """Diagnosis run by run, which goes on from the history of a robot.
+
+    The history lies in the store, beside the calibration, or beside `start.out`.
+
+    Args:
+        bayes: How to diagnose.
+        start: What it begins with.
 
     Raises:
-        InputError: If there are both, or the history cannot be read.
+        InputError: If there are two places for the history, or it cannot be read.
     """
-    uncalibrated = calibration is None or calibration == Path(GENERIC)
-    if out is not None and not uncalibrated:
+
+    def __init__(self, bayes: BayesDiagnoser, start: Start) -> None:
+        self._bayes = bayes
+        self._out = start.out
+        stored = start.stored
+        self._keeper = None if stored is None else _keeper_of(stored)
+        if start.out is not None:
+            _check_out(start, bayes.twin.robot)
+        self._history = self._opened(start)
+
+    def _opened(self, start: Start) -> History:
+        begun = begin(self._bayes, start.cold)
+        if self._keeper is not None:
+            return self._keeper.history(begun, start.cold)
+        beside = start.out if start.cold else start.calibration
+        if beside is None:
+            return History(begun, start.cold)
+        return open_history(beside, begun, start.cold)
+
+    def diagnose(self, runs: xr.Dataset) -> Findings:
+        """Return diagnoses of runs, each by those before it."""
+        with progress_bar("diagnosing", runs.sizes["run"]) as advance:
+            found = diagnose_tracked(runs, self._bayes, self._history, advance)
+        keep = partial(self._keep, runs, found)
+        return Findings(found.diagnoses, self._bayes, lines=[tracking_line(found)], keep=keep)
+
+    def _keep(self, runs: xr.Dataset, found: Tracked, at: datetime | None) -> None:
+        if self._out is not None:
+            save_calibration(calibration_of(found.life, runs), self._bayes.twin.robot, self._out)
+        if self._keeper is not None:
+            self._keeper.keep(found.life, found.rows, at)
+        else:
+            keep_history(found.history, found.life, found.rows)
+
+
+def _keeper_of(stored: RobotRecord) -> LifeKeeper:
+    from failuretwin.app.life_keeper import LifeKeeper  # needs the extra `store`
+
+    return LifeKeeper(stored, "diagnose")
+
+
+def _check_out(start: Start, robot: Robot) -> None:
+    """Raise InputError unless `start.out` is the one place for what is learned."""
+    if not start.cold:
         raise InputError(
             "--track keeps what it learns beside the calibration that it began with. Leave out "
             "--out, or --calibration to begin with the arm class."
         )
-    if out is not None:
-        robot = bayes.twin.robot
-        check_calibration_file(out, robot, learned_name(robot))
-    start, beside = begin(bayes, uncalibrated), out if uncalibrated else calibration
-    if beside is None:
-        return History(start, uncalibrated)
-    return open_history(beside, start, uncalibrated)
-
-
-def tracked(
-    runs: xr.Dataset, bayes: BayesDiagnoser, history: History, out: Path | None
-) -> Findings:
-    """Return diagnoses that learn the robot run by run; `history` holds its earlier runs."""
-    with progress_bar("diagnosing", runs.sizes["run"]) as advance:
-        found = diagnose_tracked(runs, bayes, history, advance)
-
-    def keep() -> None:
-        if out is not None:
-            save_calibration(calibration_of(found.life, runs), bayes.twin.robot, out)
-        keep_history(found.history, found.life, found.rows)
-
-    return Findings(found.diagnoses, bayes, lines=[tracking_line(found)], keep=keep)
+    if start.out is not None:
+        check_calibration_file(start.out, robot, learned_name(robot))
 
 
 def ruled_out_note(

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from datetime import date
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console, Group, RenderableType
@@ -37,6 +38,9 @@ from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.inference.calibration_fit import MISFIT
 from failuretwin.inference.explanation import percent
 
+if TYPE_CHECKING:
+    from failuretwin.app.watch_keeper import WatchKeeper
+
 REFRESH_S = 0.25
 """Time between two drawings [s]."""
 POLL_S = 0.1
@@ -48,10 +52,10 @@ LATE_S = 0.3
 class _Screen:
     """Reports changes: in a view on a terminal, else a line for each change."""
 
-    def __init__(self, shadow: Shadow, live: Live | None) -> None:
+    def __init__(self, shadow: Shadow, live: Live | None, keeper: WatchKeeper | None) -> None:
         motors = shadow.twin.robot.motor_names
         self.changes = Changes(motors)
-        self._shadow, self._live = shadow, live
+        self._shadow, self._live, self._keeper = shadow, live, keeper
         self._view = View(motors, shadow.source.name)
         self._start_s, self._drawn_s, self._set_up_told = time.monotonic(), 0.0, False
 
@@ -59,9 +63,10 @@ class _Screen:
         """Report the changes since the last call."""
         shadow, monitor = self._shadow, self._shadow.monitor
         troubles = _troubles(shadow, time.monotonic() - self._start_s)
+        if self._keeper is not None and self._keeper.trouble:
+            troubles += (self._keeper.trouble,)
         jumps = shadow.clock.jumps
-        for change in self.changes.notice(shadow.snapshot, shadow.counts, jumps, troubles):
-            self._tell(change)
+        self._tell(*self.changes.notice(shadow.snapshot, shadow.counts, jumps, troubles))
         if monitor is not None and monitor.set_up is not None and not self._set_up_told:
             self._set_up_told = True
             self.say(fit_of(monitor))
@@ -82,22 +87,31 @@ class _Screen:
         """Report something else."""
         self._tell(self.changes.add(self._shadow.snapshot.stream_time, text))
 
-    def _tell(self, change: Change) -> None:
+    def _tell(self, *changes: Change) -> None:
+        """Store changes, then tell them."""
+        if self._keeper is not None:
+            self._keeper.keep(changes, self._shadow.snapshot.answer)
         if self._live is None:
-            tell(str(change))
+            for change in changes:
+                tell(str(change))
 
 
 def watch_until_end(
-    shadow: Shadow, console: Console, until_s: float, prober: Prober | None = None
+    shadow: Shadow,
+    console: Console,
+    until_s: float,
+    prober: Prober | None = None,
+    keeper: WatchKeeper | None = None,
 ) -> Changes:
     """Watch a robot until `until_s` of our monotonic clock [s], and return all that has changed.
 
     A terminal gets a live view, other outputs a line for each change. With a prober, one of the
-    sinks, the robot makes diagnostic movements when they are due.
+    sinks, the robot makes diagnostic movements when they are due. A keeper stores each change
+    before it is told.
     """
     live = Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext()
     with live as shown:
-        screen, going = _Screen(shadow, shown), True
+        screen, going = _Screen(shadow, shown, keeper), True
         while going:
             going = shadow.step(POLL_S) and time.monotonic() < until_s
             screen.look(last=not going)

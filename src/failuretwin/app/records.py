@@ -1,117 +1,21 @@
-"""The store behind commands: what they take from it, what they add, and how it is shown."""
+"""Histories and answers of the store as sentences, tables and a page."""
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+import math
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from failuretwin.app.terminal import Part, Table, tell
-from failuretwin.connection.calibration.result import Calibration, calibration_text
+import numpy as np
+
+from failuretwin.app.terminal import Part, Table
 from failuretwin.core.errors import counted
-from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.core.runs import concatenate
-from failuretwin.data_knowledge.records.history import (
-    FaultEpisode,
-    History,
-    StoredCalibration,
-    state_counts,
-)
-from failuretwin.data_knowledge.records.log_files import log_file
+from failuretwin.data_knowledge.records.history import FaultEpisode, History, state_counts
+from failuretwin.data_knowledge.records.offsets import Drift
 from failuretwin.data_knowledge.records.queries import QueryAnswer
-from failuretwin.data_knowledge.records.store import Store
 from failuretwin.data_knowledge.store import filling
-from failuretwin.digital_model.calibrated_robot import CalibratedRobot, calibration_from_table
-from failuretwin.digital_model.robot import Robot
-
-if TYPE_CHECKING:
-    import xarray as xr
-
-
-class DiagnosisKeeper:
-    """Keeps the diagnoses of one command, log by log.
-
-    Args:
-        store: The store.
-        logs: The logs.
-        read: Returns the runs of each log as a run set of its own.
-        robot_name: Name of the robot; None: that of its profile.
-        recorded: When they were recorded (UTC); None: when each was last modified.
-    """
-
-    def __init__(
-        self,
-        store: Store,
-        logs: Sequence[Path],
-        read: Callable[[Robot], list[xr.Dataset]],
-        robot_name: str | None,
-        recorded: datetime | None,
-    ) -> None:
-        self._store = store
-        self._logs = logs
-        self._read = read
-        self._robot_name = robot_name
-        self._recorded = recorded
-        self._parts: list[xr.Dataset] = []
-        self._calibration: StoredCalibration | None = None
-
-    def calibrated(self, robot: Robot) -> CalibratedRobot | None:
-        """Return the robot with its calibration of the store, and say so; None: it has none."""
-        name = self._robot_name or robot.name
-        stored = self._calibration = self._store.calibration(name)
-        if stored is None:
-            return None
-        since = f"{stored.valid_from:%Y-%m-%d}"
-        tell(f"calibration of {name} from the store: {stored.name}, valid from {since}", err=True)
-        where = f"{self._store.name}: calibration {stored.name!r}"
-        return calibration_from_table(tomllib.loads(stored.document), robot, where)
-
-    def runs(self, robot: Robot) -> xr.Dataset:
-        """Return the runs of all logs as one run set."""
-        self._parts = self._read(robot)
-        return concatenate(self._parts)
-
-    def remember(self, diagnoses: Sequence[Diagnosis], robot: Robot) -> list[str]:
-        """Store the diagnoses of all runs, and return what was stored, in lines."""
-        name, rest = self._robot_name or robot.name, list(diagnoses)
-        added = known = 0
-        changed: dict[int, FaultEpisode] = {}
-        for log, part in zip(self._logs, self._parts, strict=True):
-            names = map(str, part["run"].values)
-            own = [replace(one, run=run) for run, one in zip(names, rest, strict=False)]
-            del rest[: len(own)]
-            done = self._store.remember(
-                own,
-                name,
-                log=log_file(log, self._recorded),
-                runs=part,
-                profile=robot,
-                calibration=None if self._calibration is None else self._calibration.number,
-            )
-            added, known = added + done.added, known + done.known
-            changed |= {one.number: one for one in done.episodes}
-        before = f", {known} known before" if known else ""
-        first = f"remembered in {self._store.name}: {counted(added, 'run')} of {name}{before}"
-        return [first, *(episode_line(one) for one in changed.values())]
-
-
-def keep_calibration(store: Store, name: str, found: Calibration, robot: Robot) -> str:
-    """Store a calibration, and return what was stored, in a line."""
-    figures = found.imperfections
-    kept = store.keep_calibration(
-        name,
-        calibration_text(found, robot),
-        name=figures.name,
-        protocol=figures.protocol,
-        profile=robot,
-    )
-    return f"remembered in {store.name}: calibration {kept.name} of {name}, in force from now on"
-
-
-# Words and tables.
 
 
 def episode_line(episode: FaultEpisode) -> str:
@@ -129,6 +33,9 @@ def history_parts(history: History) -> list[Part]:
         parts.append(f"diagnosed: {state_counts(history.counts)}")
     if history.episodes:
         parts += ["", _episodes_table(history.episodes)]
+    wear = [one for one in history.drifts if len(one.at) > 1]
+    if wear:
+        parts += ["", _wear_table(wear)]
     if history.timeline:
         rows = [[_time(one.at), one.kind, one.text] for one in history.timeline]
         parts += ["", Table(["when (UTC)", "event", ""], rows, title="timeline")]
@@ -149,6 +56,37 @@ def _episodes_table(episodes: Sequence[FaultEpisode]) -> Table:
     ]
     headings = ["episode", "motor", "mode", "state", "since", "until", "finding"]
     return Table(headings, rows, "rllllll", title="fault episodes")
+
+
+SHOWN = {"rad": (180.0 / math.pi, "deg"), "m": (1e3, "mm")}
+"""Factor and unit in which an angle or a length is shown."""
+BLOCKS = "▁▂▃▄▅▆▇█"
+
+
+def _wear_table(drifts: Sequence[Drift]) -> Table:
+    """Return the offsets of the motors over time: first and last value, and the way between."""
+    rows = [_wear_row(one) for one in drifts]
+    headings = ["motor", "offset", "first", "last", "change", "unit", "over time"]
+    return Table(headings, rows, "llrrrll", title="wear (mean +- standard deviation)")
+
+
+def _wear_row(drift: Drift) -> list[str]:
+    base, slash, load = drift.unit.partition("/")
+    factor, unit = SHOWN.get(base, (1.0, base))
+    first, last = (
+        f"{factor * drift.values[k]:+.2f} +- {factor * drift.deviations[k]:.2f}" for k in (0, -1)
+    )
+    change = f"{factor * drift.change:+.2f}"
+    return [drift.motor, drift.name, first, last, change, unit + slash + load, _course(drift)]
+
+
+def _course(drift: Drift) -> str:
+    """Return the values as blocks; their height spans six deviations at least."""
+    values = np.asarray(drift.values)
+    low, high = values.min(), values.max()
+    span = max(high - low, 6.0 * float(np.median(drift.deviations)), 1e-12)
+    share = (values - 0.5 * (low + high)) / span + 0.5
+    return "".join(BLOCKS[int(one)] for one in np.round(share * (len(BLOCKS) - 1)))
 
 
 def _finding(episode: FaultEpisode) -> str:

@@ -117,7 +117,7 @@ def keep_history(history: History, life: LifeFilter, rows: Sequence[dict[str, An
             f"{path}: has changed since it was read; another diagnosis tracks with the same "
             "calibration. It is as that one left it; run the command again."
         )
-    lines = [_head(history.life)] if history.size == 0 else []
+    lines = [start_of(history.life)] if history.size == 0 else []
     text = "".join(f"{json.dumps(line)}\n" for line in [*lines, *rows]).encode()
     before = path.read_bytes()[: history.size] if history.size else b""
     with replacing(path) as partial:
@@ -135,17 +135,17 @@ def _counted(state: Path) -> int:
         return int(stored[SIZE])
 
 
-def _head(start: LifeFilter) -> dict[str, Any]:
-    """Return the first line: which robot, which prior and which limits the history is of."""
-    given = start.begun
-    known = [given.settling, given.variation, start.limits]
-    return {"history_of": start.model.twin.robot.name, "calibration": fingerprint(known)}
+def start_of(life: LifeFilter) -> dict[str, Any]:
+    """Return which robot, which prior and which limits a history is of."""
+    given = life.begun
+    known = [given.settling, given.variation, life.limits]
+    return {"history_of": life.model.twin.robot.name, "calibration": fingerprint(known)}
 
 
 def _check_head(head: dict[str, Any], path: Path, start: LifeFilter) -> None:
     if "history_of" not in head or "calibration" not in head:
         raise InputError(f"{path}: is no history of a calibration. Move it away.")
-    if head != _head(start):
+    if head != start_of(start):
         raise InputError(
             f"{path}: is the history of another calibration (of robot {head['history_of']!r}); the "
             "one beside it has been learned again since. Move the history away to begin a new one."

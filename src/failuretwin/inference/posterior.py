@@ -104,6 +104,7 @@ def prior_odds(hypothesis: Hypothesis) -> float:
 def log_prior(hypotheses: Sequence[Hypothesis], priors: Priors) -> FloatArray:
     """Return the log prior probability of each hypothesis, (hypothesis,)."""
     odds = np.array([prior_odds(h) if h.known else UNKNOWN_ODDS for h in hypotheses])
+    odds *= [priors.factor_of(h) for h in hypotheses]
     odds[[h.is_healthy for h in hypotheses]] *= priors.healthy_odds
     return np.asarray(np.log(odds / odds.sum()))
 
@@ -116,7 +117,7 @@ def marginal_likelihoods(
     weights = {h: marginal_likelihood_of(likelihood, h, priors) for h in known}
     if len(known) < len(hypotheses):
         others = [
-            (prior_odds(h), marginal_likelihood_of(likelihood, h, priors))
+            (prior_odds(h) * priors.factor_of(h), marginal_likelihood_of(likelihood, h, priors))
             for h in unlisted(likelihood, known)
         ]
         weights[UNKNOWN] = unknown_likelihood(likelihood, _healthy_likelihood, others, known)

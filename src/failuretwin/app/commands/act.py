@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from failuretwin.app.commands import options as opt
+from failuretwin.app.commands.store import StoreOptions, store_options
 from failuretwin.app.terminal import show, tell, write_json
 from failuretwin.connection.links import NETWORKS, ROS1
 from failuretwin.core.errors import InputError
@@ -39,6 +40,7 @@ from failuretwin.core.errors import InputError
 @opt.json_option("Write one object a target, one a line.")
 @opt.arm_options
 @opt.safety_options
+@store_options
 @opt.plugin_option
 @opt.calibrated_robot_options()
 def act(
@@ -51,6 +53,7 @@ def act(
     json_file: Path | None,
     arm: opt.ArmOptions,
     safety: opt.SafetyOptions,
+    memory: StoreOptions,
     robot: opt.RobotOptions,
 ) -> None:
     """Bring the tool to the targets of TASK.csv (columns x, y, z in metres; see docs/acting.md).
@@ -59,19 +62,22 @@ def act(
     limits, speed, floor, the arm's own links. Stop with Ctrl-C, or `failuretwin stop`.
     """
     from failuretwin.app.arms import commander_of, is_moved, spared_of
+    from failuretwin.app.diary import noting, target_line
     from failuretwin.app.reports.acting_report import result_parts
     from failuretwin.decision.acting.session import Acting
     from failuretwin.decision.acting.task import ActingSettings, read_task
     from failuretwin.decision.acting.work import first_standing
 
-    known, wanted = robot.known, read_task(task)
+    wanted, (stored, known) = read_task(task), memory.look_up(robot)
     settings = ActingSettings(most_movements=most_movements, questions=questions)
     acting = Acting(known, safety.gate(known.robot), strategy, settings, None, robot.seed)
     acting = replace(acting, spared=spared_of(spare, history, acting.model, tell))
     with ExitStack() as stack:
         commander = commander_of(arm, known, robot.seed, stack)
         if is_moved(arm):
-            results = acting.work(wanted, commander, tell)
+            with noting(stored, "act", known, strategy) as say:
+                results = acting.work(wanted, commander, say)
+                say.note(*map(target_line, results))
         else:
             tell("nothing moves without --move; this is what would be ordered")
             results = acting.dry_run(wanted, first_standing(commander), tell)

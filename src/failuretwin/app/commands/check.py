@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from failuretwin.app.commands import options as opt
+from failuretwin.app.commands.store import StoreOptions, recorded_option, store_options
 from failuretwin.app.terminal import show, tell, write_json
 
 if TYPE_CHECKING:
-    from failuretwin.decision.test_motions.health_check import Checking, CheckResult
+    from failuretwin.app.remembering import RobotRecord
+    from failuretwin.decision.test_motions.health_check import Checking
+    from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 
 
 @dataclass(frozen=True)
@@ -26,14 +30,13 @@ class MotionOptions:
     usual: bool = False
     rest: float = 0.0
 
-    def checking(self, safety: opt.SafetyOptions, robot: opt.RobotOptions) -> Checking:
+    def checking(self, safety: opt.SafetyOptions, known: CalibratedRobot, seed: int) -> Checking:
         """Return the settings of a check or a design."""
         from failuretwin.app.inputs import parse_cli_hypotheses
         from failuretwin.decision.test_motions.health_check import Checking
 
-        known = robot.known
         named = parse_cli_hypotheses(self.hypotheses, known.robot)
-        return Checking(known, safety.gate(known.robot), named, self.usual, robot.seed, self.rest)
+        return Checking(known, safety.gate(known.robot), named, self.usual, seed, self.rest)
 
 
 motion_options = opt.gathered(
@@ -107,6 +110,8 @@ MOTIONS = ("written", "motions", "keep", *opt.names_of(opt.SafetyOptions))
 @opt.arm_options
 @motion_options
 @opt.safety_options
+@store_options
+@recorded_option
 @opt.plugin_option
 @opt.calibrated_robot_options()
 def check(
@@ -119,6 +124,8 @@ def check(
     arm: opt.ArmOptions,
     motion: MotionOptions,
     safety: opt.SafetyOptions,
+    memory: StoreOptions,
+    recorded: datetime | None,
     robot: opt.RobotOptions,
 ) -> None:
     """Move an arm for 20 or 60 s and report whether it is healthy, or which motor is not.
@@ -131,11 +138,13 @@ def check(
     _refuse_unused(logs, written, motions, keep)
     before = reports.kept_checks(keep) if keep is not None and keep.exists() else []
     output.check(keep)
-    checking = motion.checking(safety, robot)
+    stored, known = memory.look_up(robot)
+    checking = motion.checking(safety, known, robot.seed)
     model = checking.known.robot
     if logs:
-        _report_logs(checking.of_logs(logs), checking, output)
+        _report_logs(logs, checking, output, stored, recorded)
         return
+    opt.refuse_unused("only logs were recorded before", "recorded")
     planned = checking.motions(motion.seconds, keep if before else motions)
     if written is not None or not is_moved(arm):
         if written is None:
@@ -156,6 +165,8 @@ def check(
     if output.report is not None:
         reports.write_check_page([result], model, output.report)
     show(*reports.closing_lines(result, model))
+    if stored is not None:
+        show("", *stored.remember_check([result]))
 
 
 def _refuse_unused(
@@ -175,18 +186,34 @@ def _refuse_unused(
 
 
 def _report_logs(
-    results: Sequence[CheckResult], checking: Checking, output: opt.OutputOptions
+    logs: Sequence[Path],
+    checking: Checking,
+    output: opt.OutputOptions,
+    stored: RobotRecord | None,
+    recorded: datetime | None,
 ) -> None:
-    """Report the results of checks that were recorded elsewhere."""
+    """Report the results of checks that were recorded elsewhere, and store them."""
     from failuretwin.app.reports import check_report as reports
 
-    model = checking.known.robot
+    model, results = checking.known.robot, checking.of_logs(logs)
     for result in results:
         lines = reports.check_lines(result, model, 0.0)
         show(result.diagnosis.run, *lines, *reports.closing_lines(result, model), "")
     write_json([reports.check_record(r, model, 0.0) for r in results], output.json_file)
     if output.report is not None:
         reports.write_check_page(results, model, output.report)
+    if stored is not None:
+        show(*_remembered(logs, checking, stored, recorded))
+
+
+def _remembered(
+    logs: Sequence[Path], checking: Checking, stored: RobotRecord, recorded: datetime | None
+) -> Iterator[str]:
+    """Store the checks of each log, and yield what was stored, in lines."""
+    from failuretwin.data_knowledge.records.log_files import log_file
+
+    for log in logs:
+        yield from stored.remember_check(checking.of_logs([log]), log_file(log, recorded))
 
 
 @click.command()
@@ -210,7 +237,7 @@ def design(
     from failuretwin.app.reports.check_report import motion_lines
     from failuretwin.app.reports.isolability_report import compared_table
 
-    checking = motion.checking(safety, robot)
+    checking = motion.checking(safety, robot.known, robot.seed)
     planned = checking.motions(motion.seconds, None, movements)
     lines = motion_lines(planned, checking.known.robot, written)
     random = checking.random_motions(planned.duration_s, len(planned.orders))
@@ -239,7 +266,8 @@ def isolability(
     from failuretwin.app.reports import isolability_report as reports
 
     output.check()
-    checking = MotionOptions(hypotheses).checking(opt.SafetyOptions(), robot)
+    motion = MotionOptions(hypotheses)
+    checking = motion.checking(opt.SafetyOptions(), robot.known, robot.seed)
     model = checking.known.robot
     found = (
         checking.isolability_of(checking.random_motions())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ import click
 
 import failuretwin as ft
 from failuretwin.app.commands import options as opt
+from failuretwin.app.commands.store import StoreOptions, recorded_option, store_options
 from failuretwin.app.terminal import progress_bar, show, tell
 from failuretwin.core.errors import InputError, counted
 
@@ -26,21 +28,32 @@ if TYPE_CHECKING:
     "for a folder of pairs), or .csv.",
     required=True,
 )
+@store_options
+@recorded_option
 @opt.reading_options
 @opt.robot_options
-def import_(out: Path, reading: opt.LogOptions, robot: opt.RobotOptions) -> None:
+def import_(
+    out: Path,
+    memory: StoreOptions,
+    recorded: datetime | None,
+    reading: opt.LogOptions,
+    robot: opt.RobotOptions,
+) -> None:
     """Read logs and write them as one run set.
 
-    LOG is any input of `diagnose`.
+    LOG is any input of `diagnose`. With --store the run set is registered, without a diagnosis.
     """
     from failuretwin.data_knowledge.readers.matlab import check_export_suffix, export_runs
 
     check_export_suffix(out)
     if out.resolve() in [log.resolve() for log in reading.logs]:
         raise InputError(f"{out}: is what is to be read. Give another name to write to.")
+    stored = memory.record(robot)
     runs = reading.runs(robot.model)
     export_runs(runs, out, ft.DigitalTwin(robot.model))
     tell(f"{counted(runs.sizes['run'], 'run')} written to {out}")
+    if stored is not None:
+        tell(stored.register(out, runs, reading.logs, recorded))
 
 
 # `failuretwin simulate`: runs made by the twin.

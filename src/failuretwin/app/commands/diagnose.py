@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,17 +12,22 @@ import click
 
 import failuretwin as ft
 from failuretwin.app.commands import options as opt
-from failuretwin.app.commands.store import StoreOptions, recorded_option, store_options
+from failuretwin.app.commands.store import (
+    LEARNED,
+    LEARNED_METHOD,
+    StoreOptions,
+    learned_priors_option,
+    recorded_option,
+    store_options,
+)
 from failuretwin.app.terminal import show, tell
 from failuretwin.core.errors import InputError
 
 if TYPE_CHECKING:
-    from failuretwin.app.records import DiagnosisKeeper
-    from failuretwin.digital_model.calibrated_robot import CalibratedRobot
     from failuretwin.inference.together.fault_course import FaultCourse
 
 BAYES_ONLY = (
-    *("calibration", "track", "self_calibrate", "hypotheses"),
+    *("calibration", "track", "self_calibrate", "hypotheses", "learned_priors"),
     *("sse_range", "error_range", "onset", "sensing"),
 )
 """Options that only the Bayesian diagnosis has."""
@@ -40,7 +46,8 @@ LEARNING = ("out", "independent")
     "--track",
     "Learn the robot run by run: judge each by those before it. Give runs "
     "in their order, the oldest first. Without --calibration it begins with the arm class. The "
-    "history is kept beside the calibration, or beside --out (FILE.history.jsonl).",
+    "history is kept in the --store, else beside the calibration, or beside --out "
+    "(FILE.history.jsonl).",
 )
 @opt.flag_option(
     "--self-calibrate",
@@ -97,6 +104,7 @@ LEARNING = ("out", "independent")
     "change; `action` never does, nor does a stuck motor.",
 )
 @store_options
+@learned_priors_option
 @recorded_option
 @opt.reading_options
 @opt.plugin_option
@@ -116,6 +124,7 @@ def diagnose(
     csv_file: Path | None,
     report: Path | None,
     correct: Path | None,
+    learned_priors: bool,
     recorded: datetime | None,
     memory: StoreOptions,
     reading: opt.LogOptions,
@@ -137,9 +146,8 @@ def diagnose(
     from failuretwin.inference.observation.sensors import TOOL_ALONE, sensing_of
 
     offsets.check_correctable(reading.logs, correct)
-    calibration, together = robot.calibration, track or self_calibrate
-    keeper = memory.keeper(reading, recorded)
-    known = _known(keeper, robot, together)
+    together, (stored, known) = track or self_calibrate, memory.look_up(robot)
+    keeper = None if stored is None else stored.keeper(reading, recorded)
     bayes = ft.BayesDiagnoser(
         known.twin,
         imperfections=known.imperfections,
@@ -147,21 +155,20 @@ def diagnose(
         priors=priors_of(known.robot, sse_range, onset, error_range),
         sensing=sensing,
     )
+    if learned_priors:
+        bayes = memory.needed(stored, LEARNED).with_learned_priors(bayes)
     _refuse_unused(method == given.BAYES, track, self_calibrate)
     diagnoser = given.chosen_diagnoser(method, bayes)
-    history = learning.opened_history(bayes, calibration, out) if track else None
+    start = learning.Start(robot.calibration, out, stored)
+    tracking = learning.Tracking(bayes, start) if track else None
     runs = reading.runs(known.robot) if keeper is None else keeper.runs(known.robot)
     sensed = sensing_of(runs, sensing)
     given.warn_mismatch(runs, given.expected_name(diagnoser))
     if together:
         learning.check_learning_from(sensed)
-    if history is not None:
-        found = learning.tracked(runs, bayes, history, out)
-    elif self_calibrate:
-        found = learning.self_calibrated(runs, bayes, calibration, out)
-    else:
-        found = learning.Findings(diagnoser.diagnose(runs), bayes)
+    found = learning.found_in(runs, bayes, diagnoser, tracking, start if self_calibrate else None)
     diagnoses = given.with_doubts(found.diagnoses, runs, known.twin)
+    diagnoses = _by_learned_priors(diagnoses) if learned_priors else diagnoses
     if (sse_range or error_range) and diagnoser is bayes:
         usual = priors_of(known.robot, None, onset)
         tell(learning.ruled_out_note(runs, found.bayes, diagnoses, usual), err=True)
@@ -171,7 +178,8 @@ def diagnose(
     if report is not None:
         write_report(runs, diagnoses, known.twin, state, report, found.sections)
         tell(f"the page: {report / 'index.html'}", err=True)
-    found.keep()
+    remembered = [] if keeper is None else ["", *keeper.remember(diagnoses)]
+    found.keep(None if keeper is None else keeper.latest)
     show(*reports.diagnosis_parts(diagnoses))
     if method == given.BAYES and sensed == TOOL_ALONE:
         show(*isolability_summary(runs, found.bayes))
@@ -180,18 +188,12 @@ def diagnose(
     last = [*reports.course_lines(course, state, known.robot), *found.lines]
     show(*([""] if last else []), *last)
     show(*offsets.offset_lines(runs, known, diagnoses, reading, correct))
-    if keeper is not None:
-        show("", *keeper.remember(diagnoses, robot.model))
+    show(*remembered)
 
 
-def _known(
-    keeper: DiagnosisKeeper | None, robot: opt.RobotOptions, learning: bool
-) -> CalibratedRobot:
-    """Return the robot as calibrated by `--calibration`, or in the store where none is named."""
-    stored = None
-    if keeper is not None and robot.calibration is None and not learning:
-        stored = keeper.calibrated(robot.model)
-    return stored or robot.known
+def _by_learned_priors(diagnoses: Sequence[ft.Diagnosis]) -> list[ft.Diagnosis]:
+    """Return diagnoses whose method says that their priors were learned."""
+    return [replace(one, method=f"{one.method}; {LEARNED_METHOD}") for one in diagnoses]
 
 
 def _write(

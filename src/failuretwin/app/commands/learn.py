@@ -67,7 +67,7 @@ def calibrate(
         opt.refuse_unused("a population is not one robot", "store", "robot_name")
         _pool(reading.logs, out, name, robot)
         return
-    store = memory.opened()
+    stored = memory.record(robot)
     tests, others = step_parameters.split_step_tests(reading.logs, reading.columns)
     steps = step_parameters.learn_loops(tests, robot.model)
     model = steps.robot
@@ -87,10 +87,8 @@ def calibrate(
     ft.save_calibration(found, model, out)
     show(*calibration_parts(found, model))
     tell(f"written to {out}")
-    if store is not None:
-        from failuretwin.app.records import keep_calibration
-
-        tell(keep_calibration(store, memory.name_of(model), found, robot.model))
+    if stored is not None:
+        tell(stored.keep_calibration(found))
     if found.beats_uncalibrated is not False:
         tell(f"use it with `failuretwin diagnose --calibration {out}`")
 

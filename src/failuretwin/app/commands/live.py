@@ -4,18 +4,31 @@ from __future__ import annotations
 
 import math
 import time
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import click
 
 from failuretwin.app.commands import options as opt
+from failuretwin.app.commands.store import (
+    LEARNED,
+    StoreOptions,
+    learned_priors_option,
+    recorded_option,
+    store_options,
+)
 from failuretwin.app.terminal import console, tell, until_interrupted
 from failuretwin.connection.links import NETWORKS, ROS1
 from failuretwin.decision.streaming import STREAMED
 
 if TYPE_CHECKING:
+    from failuretwin.app.life_keeper import LifeKeeper
+    from failuretwin.app.remembering import RobotRecord
+    from failuretwin.app.watch_keeper import WatchKeeper
     from failuretwin.connection.links.base import Commander
+    from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+    from failuretwin.inference.faults.priors import Priors
 
 
 PROBING = ("idle", "move", *opt.names_of(opt.SafetyOptions))
@@ -45,9 +58,17 @@ PROBING = ("idle", "move", *opt.names_of(opt.SafetyOptions))
     "as /joint_states; errors show sooner, but a wrong reading is taken for the motor. goals: the "
     "goals that they report to have received; a stuck motor shows sooner.",
 )
+@opt.flag_option(
+    "--track",
+    "With --store: begin with what earlier watches have learned of this robot, and keep what this "
+    "one learns. A robot that its calibration fits teaches nothing.",
+)
 @opt.probe_options
 @opt.safety_options
 @opt.live_options
+@store_options
+@learned_priors_option
+@recorded_option
 @opt.plugin_option
 @opt.calibrated_robot_options()
 def watch(
@@ -55,9 +76,13 @@ def watch(
     record: Path | None,
     budget: float,
     sensing: str,
+    track: bool,
     probe: opt.ProbeOptions,
     safety: opt.SafetyOptions,
     live: opt.LiveOptions,
+    memory: StoreOptions,
+    learned_priors: bool,
+    recorded: datetime | None,
     robot: opt.RobotOptions,
 ) -> None:
     """Watch a robot as a digital shadow: listen, report faults, and move nothing.
@@ -69,7 +94,8 @@ def watch(
     SOURCE is `ros1`, `ros2[://HOST[:PORT]]` (over Zenoh), `rosbridge://HOST[:PORT]`, `emulated` (a
     robot simulated by physics), a log to replay (a raw session, a bag, a recording), or your own
     source, MODULE:CLASS, a class that follows failuretwin.Source. On a ROS network the diagnosis is
-    published on /diagnostics. Stop with Ctrl-C.
+    published on /diagnostics. With --store each change is stored before it is printed. Stop with
+    Ctrl-C.
     """
     from contextlib import ExitStack
 
@@ -80,12 +106,16 @@ def watch(
     from failuretwin.connection.links.ros_topics import load_topics
     from failuretwin.connection.links.statuses import statuses
     from failuretwin.decision.streaming.monitor import monitor
+    from failuretwin.decision.streaming.set_up_watch import PROOF
     from failuretwin.decision.test_motions.probing import Prober
 
     if not probe.probes:
         opt.refuse_unused("nothing is moved without --probe N", *PROBING)
-    model, known = robot.model, robot.known
-    diagnoser = monitor(known.twin, known.imperfections, budget, sensing)
+    model, (stored, known) = robot.model, memory.look_up(robot)
+    life = _life(memory.needed(stored, "--track")) if track else None
+    resumed = (lambda start: start) if life is None else life.resumed
+    priors = _learned_priors(memory.needed(stored, LEARNED)) if learned_priors else None
+    diagnoser = monitor(known.twin, known.imperfections, budget, sensing, resumed, priors)
     wait_s = load_topics(live.topics).wait_s
     tell(basis_line(known, robot.calibration, budget, "goals" in sensing))
     # An emulated robot ends by itself, a log when it is over.
@@ -101,11 +131,56 @@ def watch(
         if record is not None:
             sinks.append(stack.enter_context(Recorder(record, model)))
         shadow = Shadow(link, diagnoser, known.twin, sinks, wait_s)
+        keeper = None
+        if stored is not None:
+            keeper = _begun(stored, source, sensing, known, recorded)
         with until_interrupted():
-            watch_until_end(shadow, console(), time.monotonic() + length, prober)
+            watch_until_end(shadow, console(), time.monotonic() + length, prober, keeper)
+    if keeper is not None:
+        keeper.end(shadow.snapshot, decided=diagnoser.fit.seen > PROOF)
     arm = statuses(shadow.snapshot.answer, model.motor_names)[0]
     tell(fit_of(diagnoser))
     tell(f"last answer: {arm}")
+    if stored is not None:
+        tell("" if life is None else life.keep_watch(diagnoser.life))
+        tell(f"remembered in {stored.store.name}: watch of {stored.name}")
+
+
+def _learned_priors(stored: RobotRecord) -> Priors:
+    """Return the priors that the store teaches."""
+    from failuretwin.core.hypothesis import paper_hypotheses
+    from failuretwin.inference.faults.priors import Priors
+
+    considered = paper_hypotheses(stored.profile.motor_names)
+    return Priors(fault_factors=stored.fault_factors(considered))
+
+
+def _life(stored: RobotRecord) -> LifeKeeper:
+    """Return what keeps that which the robot teaches from watch to watch."""
+    from failuretwin.app.life_keeper import LifeKeeper
+
+    return LifeKeeper(stored, "watch")
+
+
+def _begun(
+    stored: RobotRecord,
+    source: str,
+    sensing: str,
+    known: CalibratedRobot,
+    recorded: datetime | None,
+) -> WatchKeeper:
+    """Return what keeps a watch, whose session has begun; a source that is a path is a log."""
+    from failuretwin.app.watch_keeper import begin_watch
+    from failuretwin.data_knowledge.records.log_files import log_file
+    from failuretwin.data_knowledge.records.rows import Basis
+
+    healthy = known.imperfections
+    method = f"watch, {sensing}; healthy behaviour: {healthy.name}"
+    basis = Basis("watch", stored.calibration_number, method, healthy.protocol)
+    replayed = source != opt.EMULATED and Path(source).exists()
+    if not replayed:
+        opt.refuse_unused("only logs were recorded before", "recorded")
+    return begin_watch(stored, source, basis, log_file(source, recorded) if replayed else None)
 
 
 @click.command()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,11 +10,21 @@ import click
 
 import failuretwin as ft
 from failuretwin.app.commands import options as opt
+from failuretwin.app.commands.store import (
+    LEARNED,
+    LEARNED_METHOD,
+    StoreOptions,
+    learned_priors_option,
+    store_option,
+)
 from failuretwin.app.terminal import show, tell, write_json
 from failuretwin.core.errors import InputError, OutputError
+from failuretwin.core.hypothesis import Hypothesis
 
 if TYPE_CHECKING:
+    from failuretwin.app.remembering import RobotRecord
     from failuretwin.decision.remaining_life import RemainingLife
+    from failuretwin.decision.results import Record
 
 
 @click.command()
@@ -79,6 +90,8 @@ Report = tuple[list[str], list[dict[str, Any]]]
 @opt.file_option("--template", "FILE.toml", "Write a cost table to fill in.")
 @click.option("--run", metavar="NAME", help="Run to use. Default: the last one.")
 @opt.json_option("Write the advice.")
+@store_option
+@learned_priors_option
 @opt.calibrated_robot_options()
 def advise(
     source: Path | None,
@@ -86,6 +99,8 @@ def advise(
     template: Path | None,
     run: str | None,
     json_file: Path | None,
+    store: str | None,
+    learned_priors: bool,
     robot: opt.RobotOptions,
 ) -> None:
     """Report the cheapest action: continue, compensate, slow down, inspect, replace, stop.
@@ -108,7 +123,11 @@ def advise(
                 "costs are yours to say: name a file (--costs FILE.toml). `failuretwin advise "
                 "--template FILE.toml` writes one to be filled in."
             )
-        lines, records = _results_report(source, costs, run)
+        stored = None
+        if learned_priors:
+            memory = StoreOptions(store, None)
+            stored = memory.needed(memory.record(robot), LEARNED)
+        lines, records = _results_report(source, costs, run, stored)
     show(*lines)
     write_json(records, json_file)
 
@@ -123,8 +142,10 @@ def _write_template(path: Path) -> None:
     write_text(TEMPLATE, path)
 
 
-def _results_report(source: Path, costs_file: Path, run: str | None) -> Report:
-    """Return the advice on a stored diagnosis.
+def _results_report(
+    source: Path, costs_file: Path, run: str | None, stored: RobotRecord | None
+) -> Report:
+    """Return the advice on a stored diagnosis, by the learned priors of a store if there is one.
 
     Raises:
         InputError: If a file cannot be read, or there is no such run.
@@ -138,7 +159,7 @@ def _results_report(source: Path, costs_file: Path, run: str | None) -> Report:
     if not chosen:
         raise InputError(f"{source}: no run {run!r}. The last is {found[-1].run!r}.")
     diagnosis = chosen[-1]
-    advice = advise_on(diagnosis.posterior, costs)
+    advice = advise_on(_posterior(diagnosis, stored), costs)
     lines = [f"run {diagnosis.run}: {diagnosis.verdict or diagnosis.diagnosis}"]
     lines += [f"  {option!s:24s} {option.cost:10.4g}" for option in advice.options]
     record = {
@@ -149,6 +170,16 @@ def _results_report(source: Path, costs_file: Path, run: str | None) -> Report:
         "hinge_probability": advice.hinge_probability if advice.hinge else None,
     }
     return [*lines, advice.verdict], [record]
+
+
+def _posterior(diagnosis: ft.Diagnosis | Record, stored: RobotRecord | None) -> Mapping[str, float]:
+    """Return the posterior of a diagnosis, by the learned priors of a store if there is one."""
+    if stored is None or LEARNED_METHOD in diagnosis.method:
+        return diagnosis.posterior
+    from failuretwin.connection.fault_rates import reweighted
+
+    hypotheses = [Hypothesis.parse(name) for name in diagnosis.posterior]
+    return reweighted(diagnosis.posterior, stored.fault_factors(hypotheses))
 
 
 def _life_report(source: Path, robot: opt.RobotOptions) -> Report:

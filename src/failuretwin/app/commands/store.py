@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +15,8 @@ from failuretwin.core.errors import InputError, counted
 from failuretwin.data_knowledge.records import CHECK_DAYS
 
 if TYPE_CHECKING:
-    from failuretwin.app.records import DiagnosisKeeper
+    from failuretwin.app.remembering import RobotRecord
+    from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 
 # Options of commands that use the store.
 
@@ -39,25 +39,38 @@ class StoreOptions:
     store: str | None
     robot_name: str | None
 
-    def opened(self) -> ft.Store | None:
-        """Return the store; None: nothing is remembered."""
-        if self.store:
-            return ft.open_store(self.store)
-        opt.refuse_unused("nothing is remembered without --store", "robot_name", "recorded")
-        return None
+    def look_up(self, robot: opt.RobotOptions) -> tuple[RobotRecord | None, CalibratedRobot]:
+        """Return the robot in the store, and as it is calibrated.
 
-    def keeper(self, reading: opt.LogOptions, recorded: datetime | None) -> DiagnosisKeeper | None:
-        """Return what keeps the diagnoses of some logs; None: nothing is remembered."""
-        store = self.opened()
-        if store is None:
+        It has the calibration of `--calibration`, else the one in force in the store, else that of
+        its profile. Without `--store` there is no record.
+        """
+        record = self.record(robot)
+        if record is not None and robot.calibration is None:
+            record = record.with_calibration()
+        stored = None if record is None else record.calibrated
+        return record, stored or robot.known
+
+    def needed(self, stored: RobotRecord | None, option: str) -> RobotRecord:
+        """Return the robot in the store, which an option needs.
+
+        Raises:
+            InputError: If there is no store.
+        """
+        if stored is None:
+            raise InputError(f"{option} needs a store. Name one: --store robots.db.")
+        return stored
+
+    def record(self, robot: opt.RobotOptions) -> RobotRecord | None:
+        """Return the robot in the store; None: nothing is remembered."""
+        if not self.store:
+            opt.refuse_unused("nothing is remembered without --store", "robot_name", "recorded")
             return None
-        from failuretwin.app.records import DiagnosisKeeper
+        store = ft.open_store(self.store)
+        from failuretwin.app.remembering import RobotRecord
 
-        return DiagnosisKeeper(store, reading.logs, reading.parts, self.robot_name, recorded)
-
-    def name_of(self, robot: ft.Robot) -> str:
-        """Return the name of this robot in the store."""
-        return self.robot_name or robot.name
+        model = robot.model
+        return RobotRecord(store, self.robot_name or model.name, model)
 
 
 store_options = opt.gathered(
@@ -69,6 +82,13 @@ store_options = opt.gathered(
         metavar="NAME",
         help="With --store: name of this very robot. Default: the name of its profile.",
     ),
+)
+LEARNED, LEARNED_METHOD = "--learned-priors", "learned priors"
+"""The option, and what the method of a diagnosis says of it."""
+learned_priors_option = opt.flag_option(
+    LEARNED,
+    "With --store: faults that people confirmed at robots of this kind count more, others less, "
+    "than by the assumed rates.",
 )
 recorded_option = click.option(
     "--recorded",

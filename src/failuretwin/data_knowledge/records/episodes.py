@@ -9,13 +9,15 @@
 4. A healthy diagnosis clears all open episodes. A diagnosis of another mode of the same motor
    clears its episode and begins another; so does any fault of a motor whose episode a person has
    found wrong, so that a finding hides no later fault. All others change nothing.
+5. The alarms of a watch begin, raise and clear episodes as they are raised and cleared. At its end
+   the last diagnosis counts like that of any run.
 
 An open episode that a person has confirmed is `confirmed`; see `history.FaultEpisode`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 
@@ -109,6 +111,23 @@ class EpisodeTracker:
             for motor in list(self._open):
                 self._clear(motor, at, number)
         for fault in named_faults(diagnosis):
+            self._name(fault, at, number)
+
+    def follow_alarm(
+        self, before: Sequence[str], faults: Sequence[NamedFault], at: datetime, number: int
+    ) -> None:
+        """Follow the alarm of a watch, which decides by its own budget of false alarms.
+
+        Args:
+            before: Motors that the alarm of this watch named before; it clears no others.
+            faults: Faults that it names now.
+            at: When (UTC).
+            number: Number of the diagnosis.
+        """
+        for motor in sorted({*before} - {fault.motor for fault in faults}):
+            if motor in self._open:
+                self._clear(motor, at, number)
+        for fault in faults:
             self._name(fault, at, number)
 
     def _name(self, fault: NamedFault, at: datetime, number: int) -> None:

@@ -73,6 +73,8 @@ def _schema(table: sa.Table) -> pa.Schema:
             return pa.timestamp("us", tz="UTC")
         if isinstance(column.type, sa.Integer):
             return pa.int64()
+        if isinstance(column.type, sa.LargeBinary):
+            return pa.binary()
         return pa.float64() if isinstance(column.type, sa.Double) else pa.string()
 
     return pa.schema(

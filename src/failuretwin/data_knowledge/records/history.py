@@ -11,19 +11,22 @@ import sqlalchemy as sa
 
 from failuretwin.core.errors import counted
 from failuretwin.data_knowledge.records.episodes import CLEARED, CONFIRMED, RAISED, SUSPECTED
+from failuretwin.data_knowledge.records.offsets import Drift, read_drifts
 from failuretwin.data_knowledge.records.schema import (
     calibrations,
     diagnoses,
     episode_events,
     episodes,
     findings,
+    notes,
     profiles,
     repairs,
     runs,
+    sessions,
 )
 
 RECENT = 20
-"""Number of diagnoses that a history lists; the others are counted."""
+"""Number of diagnoses, and of notes, that a history lists; other diagnoses are counted."""
 WRONG, OTHER_CAUSE = "wrong", "other cause"
 """Verdicts of a finding, in addition to `CONFIRMED`."""
 
@@ -130,12 +133,22 @@ class Repair:
 
 @dataclass(frozen=True)
 class StoredDiagnosis:
-    """A diagnosis in a history: time of its run (UTC), run, state and verdict."""
+    """A diagnosis in a history: time of its run (UTC), run, state, verdict and command."""
 
     at: datetime
     run: str
     state: str
     verdict: str
+    command: str
+
+
+@dataclass(frozen=True)
+class StoredNote:
+    """What happened in a session: when (UTC), the command, and a sentence."""
+
+    at: datetime
+    command: str
+    text: str
 
 
 @dataclass(frozen=True)
@@ -154,20 +167,24 @@ class History:
     Attributes:
         robot: Its name.
         kind: Name of its profile; empty if it has none.
-        counts: Number of diagnoses by state.
-        recent: The last `RECENT` diagnoses, the oldest first.
+        counts: Number of diagnoses of runs by state.
+        recent: The last `RECENT` diagnoses of runs, the oldest first.
+        notes: What happened in the last sessions, the last `RECENT` notes, the oldest first.
         episodes: Fault episodes, the oldest first.
         calibrations: Calibrations, the oldest first.
         repairs: Repairs, the oldest first.
+        drifts: Offsets of the motors over time.
     """
 
     robot: str
     kind: str
     counts: Mapping[str, int]
     recent: tuple[StoredDiagnosis, ...]
+    notes: tuple[StoredNote, ...]
     episodes: tuple[FaultEpisode, ...]
     calibrations: tuple[StoredCalibration, ...]
     repairs: tuple[Repair, ...]
+    drifts: tuple[Drift, ...] = ()
 
     @property
     def open_episodes(self) -> list[FaultEpisode]:
@@ -183,13 +200,16 @@ class History:
                 for one in self.open_episodes
             )
         if not self.recent:
-            return "no run has been diagnosed"
+            return "no open fault" if self.notes else "no run has been diagnosed"
         return f"no open fault; last run ({_day(self.recent[-1].at)}): {self.recent[-1].state}"
 
     @property
     def timeline(self) -> list[Moment]:
-        """Everything with its time, the oldest first; of the diagnoses only `recent`."""
-        moments = [Moment(one.at, "run", f"{one.run}: {one.verdict}") for one in self.recent]
+        """Everything with its time, the oldest first; of diagnoses and notes only the last."""
+        moments = [
+            Moment(one.at, _kind_of(one), f"{one.run}: {one.verdict}") for one in self.recent
+        ]
+        moments += [Moment(one.at, one.command, one.text) for one in self.notes]
         for episode in self.episodes:
             moments += _moments_of(episode)
         for calibration in self.calibrations:
@@ -201,6 +221,10 @@ class History:
 
 def _day(time: datetime) -> str:
     return f"{time:%Y-%m-%d}"
+
+
+def _kind_of(diagnosis: StoredDiagnosis) -> str:
+    return "run" if diagnosis.command == "diagnose" else diagnosis.command
 
 
 def _moments_of(episode: FaultEpisode) -> list[Moment]:
@@ -231,16 +255,16 @@ def _repair_text(repair: Repair) -> str:
 
 def read_history(connection: sa.Connection, row: int, robot: str) -> History:
     """Return the history of a robot, given its row and name."""
-    of = diagnoses.c.robot_id == row
-    table = sa.select(diagnoses.c.state, sa.func.count()).where(of).group_by(diagnoses.c.state)
     return History(
         robot,
         _kind(connection, row),
-        {str(state): int(count) for state, count in connection.execute(table)},
+        _counts(connection, row),
         _recent(connection, row),
+        _notes(connection, row),
         read_episodes(connection, row),
         read_calibrations(connection, row),
         _repairs(connection, row),
+        read_drifts(connection, row),
     )
 
 
@@ -249,15 +273,41 @@ def _kind(connection: sa.Connection, row: int) -> str:
     return connection.scalar(newest.order_by(profiles.c.id.desc()).limit(1)) or ""
 
 
+def _counts(connection: sa.Connection, row: int) -> dict[str, int]:
+    """Return the number of diagnoses by state, without those behind notes."""
+    query = sa.select(diagnoses.c.state, sa.func.count()).group_by(diagnoses.c.state)
+    every = query.where(diagnoses.c.robot_id == row)
+    noted = query.join(notes, notes.c.diagnosis_id == diagnoses.c.id).where(notes.c.robot_id == row)
+    less = {str(state): int(count) for state, count in connection.execute(noted)}
+    found = {
+        str(state): int(count) - less.get(state, 0) for state, count in connection.execute(every)
+    }
+    return {state: count for state, count in found.items() if count}
+
+
 def _recent(connection: sa.Connection, row: int) -> tuple[StoredDiagnosis, ...]:
     query = (
         sa.select(diagnoses.c.at, runs.c.name, diagnoses.c.state, diagnoses.c.verdict)
+        .add_columns(sessions.c.command)
         .join(runs, runs.c.id == diagnoses.c.run_id)
+        .join(sessions, sessions.c.id == diagnoses.c.session_id)
         .where(diagnoses.c.robot_id == row)
+        .where(~sa.exists().where(notes.c.diagnosis_id == diagnoses.c.id))
         .order_by(diagnoses.c.at.desc(), diagnoses.c.id.desc())
         .limit(RECENT)
     )
     return tuple(StoredDiagnosis(*found) for found in connection.execute(query))[::-1]
+
+
+def _notes(connection: sa.Connection, row: int) -> tuple[StoredNote, ...]:
+    query = (
+        sa.select(notes.c.at, sessions.c.command, notes.c.text)
+        .join(sessions, sessions.c.id == notes.c.session_id)
+        .where(notes.c.robot_id == row)
+        .order_by(notes.c.at.desc(), notes.c.id.desc())
+        .limit(RECENT)
+    )
+    return tuple(StoredNote(*found) for found in connection.execute(query))[::-1]
 
 
 def read_episodes(connection: sa.Connection, row: int) -> tuple[FaultEpisode, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -41,6 +41,23 @@ class QueryAnswer:
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[Any, ...], ...]
+
+
+@dataclass(frozen=True)
+class FleetFaults:
+    """Confirmed faults of the robots of a kind.
+
+    Attributes:
+        kind: Name of their profile.
+        robots: Number of robots.
+        hours: Time from the first to the last run of each, in all [h].
+        confirmed: Number of confirmed faults by ``MOTOR:MODE``.
+    """
+
+    kind: str
+    robots: int
+    hours: float
+    confirmed: Mapping[str, int]
 
 
 # Parts of the questions: the profile in force, and the finding that stands.
@@ -101,7 +118,7 @@ def _failing_motors(connection: sa.Connection, now: datetime, days: float) -> li
 
 def _time_between(connection: sa.Connection, now: datetime, days: float) -> list[tuple[Any, ...]]:
     """Time from the first to the last run of all robots of a kind, over the failures of a motor."""
-    watched = _watched_days(connection)
+    watched = watched_days(connection)
     count = sa.func.count()
     query = (
         sa.select(kinds.c.kind, judged.c.motor, count)
@@ -122,7 +139,22 @@ def _between(days: float, failures: int) -> float | None:
     return round(days / failures, 3) if days > 0.0 else None
 
 
-def _watched_days(connection: sa.Connection) -> dict[str, tuple[int, float]]:
+def fleet_faults(connection: sa.Connection, kind: str) -> FleetFaults:
+    """Return the confirmed faults of the robots of a kind."""
+    robot_count, days = watched_days(connection).get(kind, (0, 0.0))
+    query = (
+        sa.select(judged.c.motor, judged.c.mode, sa.func.count())
+        .join(kinds, kinds.c.robot_id == judged.c.robot_id)
+        .where(kinds.c.kind == kind, judged.c.verdict == CONFIRMED)
+        .group_by(judged.c.motor, judged.c.mode)
+        .order_by(judged.c.motor, judged.c.mode)
+    )
+    rows = connection.execute(query)
+    confirmed = {f"{motor}:{mode}": int(count) for motor, mode, count in rows}
+    return FleetFaults(kind, robot_count, 24.0 * days, confirmed)
+
+
+def watched_days(connection: sa.Connection) -> dict[str, tuple[int, float]]:
     """Return the number of robots of each kind, and the time they were watched in all [days]."""
     query = sa.select(kinds.c.kind, FIRST_RUN, LAST_RUN)
     found: dict[str, tuple[int, float]] = {}

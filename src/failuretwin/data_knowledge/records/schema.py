@@ -131,8 +131,9 @@ sessions = sa.Table(
     _needed("version", Text),
     _needed("method", Text),
     _needed("protocol", Text),
+    sa.Column("command", Text, nullable=False, server_default="diagnose"),
 )
-"""Diagnosis of a log: version of the package, method, and the calibration it rests on."""
+"""What a command did with a robot: version of the package, method, calibration it rests on."""
 
 logs = sa.Table(
     "logs",
@@ -226,6 +227,50 @@ findings = sa.Table(
     _needed("at", Utc),
 )
 """What people found; a row with `withdraws` takes an earlier one back."""
+
+notes = sa.Table(
+    "notes",
+    metadata,
+    _key(),
+    _of("sessions"),
+    _of("robots"),
+    sa.Column("diagnosis_id", Id, sa.ForeignKey("diagnoses.id"), index=True),
+    _needed("at", Utc),
+    _needed("text", Text),
+    sa.Index("ix_notes_robot", "robot_id", "at"),
+)
+"""What happened in a session, a sentence each, and the diagnosis behind it."""
+
+offsets = sa.Table(
+    "offsets",
+    metadata,
+    _key(),
+    _of("sessions"),
+    _of("robots"),
+    _needed("at", Utc),
+    _needed("motor", Text),
+    _needed("name", Text),
+    _needed("value", sa.Double()),
+    _needed("deviation", sa.Double()),
+    _needed("unit", Text),
+    sa.Index("ix_offsets_robot", "robot_id", "at"),
+)
+"""Offsets of the motors as a session found them: mean and standard deviation."""
+
+beliefs = sa.Table(
+    "beliefs",
+    metadata,
+    _key(),
+    _of("sessions"),
+    _of("robots"),
+    _needed("follower", Text),
+    _needed("start", Text),
+    _needed("runs", sa.Integer()),
+    _needed("rows", Json),
+    _needed("arrays", sa.LargeBinary()),
+    sa.Index("ix_beliefs_robot", "robot_id", "follower"),
+)
+"""Posterior of theta of a robot after a session, its new runs, and the start of it all."""
 
 repairs = sa.Table(
     "repairs",

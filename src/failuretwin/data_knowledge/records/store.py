@@ -11,11 +11,11 @@ Section: docs/store.md
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import sqlalchemy as sa
 
@@ -23,28 +23,30 @@ from failuretwin import __version__
 from failuretwin.core.errors import InputError, check_name
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.runs import measured_rate
-from failuretwin.data_knowledge.records import CHECK_DAYS, writing
-from failuretwin.data_knowledge.records.checking import StoreCheck, checked
+from failuretwin.data_knowledge.records import writing
+from failuretwin.data_knowledge.records.beliefs import (
+    Belief,
+    BeliefLine,
+    add_belief,
+)
 from failuretwin.data_knowledge.records.database import Database
 from failuretwin.data_knowledge.records.episodes import CONFIRMED
-from failuretwin.data_knowledge.records.export import export_parquet
 from failuretwin.data_knowledge.records.history import (
     OTHER_CAUSE,
     WRONG,
     FaultEpisode,
-    History,
     StoredCalibration,
-    read_calibrations,
     read_episodes,
-    read_history,
 )
 from failuretwin.data_knowledge.records.log_files import LogFile, log_file, utc
-from failuretwin.data_knowledge.records.queries import QueryAnswer, ask
-from failuretwin.data_knowledge.records.schema import (
-    calibrations,
-    findings,
-    repairs,
-    robots,
+from failuretwin.data_knowledge.records.offsets import MotorOffset, add_offsets
+from failuretwin.data_knowledge.records.reading import StoreReader
+from failuretwin.data_knowledge.records.rows import Basis, SessionRows, add_rows
+from failuretwin.data_knowledge.records.schema import repairs
+from failuretwin.data_knowledge.records.sessions import Note, Session, add_notes
+from failuretwin.data_knowledge.records.statements import (
+    add_finding,
+    replace_calibration,
 )
 from failuretwin.digital_model.robot import Robot
 
@@ -70,7 +72,7 @@ class Remembered:
     episodes: tuple[FaultEpisode, ...]
 
 
-class Store:
+class Store(StoreReader):
     """A store of robots; `open_store` returns one.
 
     Every call is one transaction and holds no connection afterwards. Evidence is append-only.
@@ -80,14 +82,6 @@ class Store:
     Args:
         database: The database with the tables.
     """
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
-
-    @property
-    def name(self) -> str:
-        """Path of the SQLite file, or URL without the password."""
-        return self._database.name
 
     # Diagnoses.
 
@@ -100,6 +94,8 @@ class Store:
         runs: xr.Dataset | None = None,
         profile: Robot | None = None,
         calibration: int | None = None,
+        command: str = "diagnose",
+        offsets: Sequence[MotorOffset] = (),
     ) -> Remembered:
         """Store the diagnoses of the runs of one log, in the order of the log.
 
@@ -116,6 +112,8 @@ class Store:
             profile: The robot's profile, stored if it is new.
             calibration: Number of the stored calibration that the diagnoses rest on; None: none of
                 the store.
+            command: The command that made them.
+            offsets: Offsets of the motors that it measured.
 
         Raises:
             InputError: If the log cannot be read or the name of the robot cannot be shown.
@@ -129,18 +127,89 @@ class Store:
             row = writing.keep_robot(connection, robot, profile)
             at = writing.keep_log(connection, row, source)
             names = [one.run for one in diagnoses]
-            run_rows, new = writing.keep_runs(connection, at, names, details)
-            kept = writing.new_diagnoses(connection, at, diagnoses, run_rows, calibration)
+            run_rows, _ = writing.keep_runs(connection, at, names, details)
+            kept, seen = writing.new_diagnoses(connection, at, diagnoses, run_rows, calibration)
+            if not kept:
+                return Remembered(0, len(diagnoses), ())
             tracker = writing.tracker_of(connection, row)
             if source.recorded >= (writing.latest_run(connection, row) or source.recorded):
                 for number, (diagnosis, run, _) in enumerate(kept):
-                    if run in new:
+                    if run not in seen:
                         tracker.follow(diagnosis, source.recorded, number)
-            rows = writing.add_diagnoses(connection, row, kept, source.recorded, calibration)
+            basis = Basis(command, calibration, diagnoses[0].method, diagnoses[0].protocol)
+            of = SessionRows(writing.add_session(connection, row, basis), row)
+            rows = writing.add_diagnoses(connection, of, kept, source.recorded)
+            add_offsets(connection, of, source.recorded, offsets)
             changed = writing.keep_episodes(connection, row, tracker.changed, rows)
             return Remembered(
                 len(kept), len(diagnoses) - len(kept), _episodes_of(connection, row, changed)
             )
+
+    # Sessions.
+
+    def begin(
+        self,
+        robot: str,
+        basis: Basis,
+        *happened: Note,
+        log: LogFile | None = None,
+        runs: Sequence[str] = (),
+        profile: Robot | None = None,
+    ) -> Session:
+        """Begin a session that is stored as it happens, such as that of a watch.
+
+        Args:
+            robot: Name of the robot, made if it is new.
+            basis: The command, and what its results rest on.
+            happened: First notes.
+            log: The log, by path and checksum; None: there is none.
+            runs: Names of its runs; diagnoses of the session belong to the first.
+            profile: The robot's profile, stored if it is new.
+
+        Raises:
+            InputError: If the name of the robot cannot be shown.
+            OutputError: If nothing could be stored.
+        """
+        with self._database.writing() as connection:
+            row = writing.keep_robot(connection, robot, profile)
+            known = list[int]()
+            if log is not None:
+                at = writing.keep_log(connection, row, log)
+                known, _ = writing.keep_runs(connection, at, runs, [None] * len(runs))
+            session = writing.add_session(connection, row, basis)
+            of = SessionRows(session, row, known[0] if known else None)
+            add_notes(connection, of, happened)
+        return Session(self._database, of)
+
+    def keep_belief(
+        self,
+        robot: str,
+        basis: Basis,
+        line: BeliefLine,
+        belief: Belief,
+        at: datetime,
+        offsets: Sequence[MotorOffset] = (),
+        profile: Robot | None = None,
+    ) -> None:
+        """Store the posterior of theta of a robot, from which the next session goes on.
+
+        Args:
+            robot: Name of the robot, made if it is new.
+            basis: The command, and the calibration that the line began with.
+            line: The line of beliefs that it goes on.
+            belief: The belief.
+            at: When the last of its runs was (UTC).
+            offsets: The offsets that it holds, for people.
+            profile: The robot's profile, stored if it is new.
+
+        Raises:
+            OutputError: If it could not be stored, or another session went on meanwhile.
+        """
+        with self._database.writing() as connection:
+            row = writing.keep_robot(connection, robot, profile)
+            of = SessionRows(writing.add_session(connection, row, basis), row)
+            add_belief(connection, of, line, belief)
+            add_offsets(connection, of, at, offsets)
 
     # People.
 
@@ -172,7 +241,8 @@ class Store:
         if verdict == OTHER_CAUSE and not cause:
             raise InputError("an other cause has no name. State the cause that was found.")
         stated = {"verdict": verdict, "cause": cause, "person": person, "note": note}
-        return self._add_finding(robot, episode, stated)
+        with self._database.writing() as connection:
+            return add_finding(connection, robot, episode, stated)
 
     def withdraw(
         self, robot: str, episode: int, *, person: str = "", note: str = ""
@@ -190,23 +260,8 @@ class Store:
             OutputError: If it could not be stored.
         """
         stated = {"verdict": "withdrawn", "cause": "", "person": person, "note": note}
-        return self._add_finding(robot, episode, stated, withdraw=True)
-
-    def _add_finding(
-        self, robot: str, number: int, stated: Mapping[str, Any], withdraw: bool = False
-    ) -> FaultEpisode:
         with self._database.writing() as connection:
-            row = writing.find_locked(connection, robot)
-            episode = _episode(connection, row, robot, number)
-            standing = episode.finding if withdraw else None
-            if withdraw and standing is None:
-                raise InputError(
-                    f"episode {number} of {robot!r} has no finding to withdraw. Expected one of "
-                    "`failuretwin found`."
-                )
-            of = {"episode_id": episode.row, "withdraws": standing and standing.number}
-            writing.add_rows(connection, findings, [{**stated, **of, "at": datetime.now(UTC)}])
-            return _episode(connection, row, robot, number)
+            return add_finding(connection, robot, episode, stated, withdraw=True)
 
     def repaired(
         self,
@@ -239,7 +294,7 @@ class Store:
                 check_name("motor", motor, motors)
             stated = {"motor": motor, "part": part, "person": person, "note": note}
             when = {"robot_id": row, "at": _or_now(at)}
-            writing.add_rows(connection, repairs, [{**stated, **when}])
+            add_rows(connection, repairs, [{**stated, **when}])
 
     # Calibrations.
 
@@ -270,68 +325,9 @@ class Store:
         start = _or_now(valid_from)
         with self._database.writing() as connection:
             row = writing.keep_robot(connection, robot, profile)
-            current = _in_force(connection, row)
-            if current is not None and current.document == document:
-                return current
-            if current is not None:
-                _close(connection, current, start)
-            stated = {"robot_id": row, "name": name, "protocol": protocol, "document": document}
+            stated = {"name": name, "protocol": protocol, "document": document}
             stated |= {"version": __version__, "sha256": writing.text_checksum(document)}
-            writing.add_rows(connection, calibrations, [{**stated, "valid_from": start}])
-            return read_calibrations(connection, row)[-1]
-
-    def calibration(self, robot: str) -> StoredCalibration | None:
-        """Return the calibration of a robot that is in force.
-
-        None: the robot has none, or the store does not know the robot.
-        """
-        with self._database.reading() as connection:
-            row = connection.scalar(sa.select(robots.c.id).where(robots.c.name == robot))
-            return None if row is None else _in_force(connection, row)
-
-    # Reading.
-
-    def robots(self) -> list[str]:
-        """Return the names of all robots, sorted."""
-        with self._database.reading() as connection:
-            return sorted(connection.scalars(sa.select(robots.c.name)))
-
-    def history(self, robot: str) -> History:
-        """Return what the store knows of a robot.
-
-        Raises:
-            InputError: If it does not know the robot.
-        """
-        with self._database.reading() as connection:
-            return read_history(connection, writing.find_robot(connection, robot), robot)
-
-    def query(self, name: str, days: float = CHECK_DAYS) -> QueryAnswer:
-        """Return the answer to a ready question.
-
-        Args:
-            name: ``failing-motors``, ``time-between-failures``, ``wrong-diagnoses`` or ``due``.
-            days: Time without a run after which a robot is due [days].
-
-        Raises:
-            InputError: If there is no such question.
-        """
-        with self._database.reading() as connection:
-            return ask(connection, name, days)
-
-    def export(self, folder: str | Path) -> dict[str, int]:
-        """Write every table to ``TABLE.parquet`` in a folder, and return the numbers of rows.
-
-        Raises:
-            InputError: If pyarrow is missing.
-            OutputError: If they cannot be written; the folder is as before.
-        """
-        with self._database.reading() as connection:
-            return export_parquet(connection, Path(folder))
-
-    def check(self) -> StoreCheck:
-        """Check the database, and whether each log is where it was and as it was."""
-        with self._database.reading() as connection:
-            return checked(connection)
+            return replace_calibration(connection, row, stated, start)
 
 
 def open_store(url: str | Path, *, create: bool = False) -> Store:
@@ -354,7 +350,7 @@ def open_store(url: str | Path, *, create: bool = False) -> Store:
     return Store(database)
 
 
-# Parts of `Store.remember`.
+# Parts of the calls.
 
 CLOCK_ERROR = timedelta(days=1)
 """Largest lead of the clock that logs are stamped by."""
@@ -387,30 +383,3 @@ def _episodes_of(
     connection: sa.Connection, robot: int, changed: Sequence[int]
 ) -> tuple[FaultEpisode, ...]:
     return tuple(one for one in read_episodes(connection, robot) if one.row in changed)
-
-
-# Parts of the other calls.
-
-
-def _episode(connection: sa.Connection, row: int, robot: str, number: int) -> FaultEpisode:
-    all_of_it = read_episodes(connection, row)
-    found = next((one for one in all_of_it if one.number == number), None)
-    if found is None:
-        valid = ", ".join(str(one.number) for one in all_of_it) or "none so far"
-        raise InputError(f"robot {robot!r} has no episode {number}. Its episodes: {valid}.")
-    return found
-
-
-def _in_force(connection: sa.Connection, robot: int) -> StoredCalibration | None:
-    stored = read_calibrations(connection, robot)
-    return next((one for one in stored if one.valid_to is None), None)
-
-
-def _close(connection: sa.Connection, current: StoredCalibration, end: datetime) -> None:
-    if end < current.valid_from:
-        raise InputError(
-            f"calibration {current.name!r} is valid from {current.valid_from:%Y-%m-%d %H:%M}, "
-            f"after {end:%Y-%m-%d %H:%M}. Expected a later time."
-        )
-    row = calibrations.c.id == current.number
-    connection.execute(sa.update(calibrations).where(row).values(valid_to=end))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
@@ -24,6 +24,7 @@ from failuretwin.data_knowledge.records.episodes import (
 )
 from failuretwin.data_knowledge.records.history import read_episodes
 from failuretwin.data_knowledge.records.log_files import LogFile
+from failuretwin.data_knowledge.records.rows import Basis, SessionRows, add_rows
 from failuretwin.data_knowledge.records.schema import (
     diagnoses,
     episode_events,
@@ -38,16 +39,6 @@ from failuretwin.data_knowledge.records.schema import (
 )
 from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.digital_model.robot import Robot
-
-
-def add_rows(
-    connection: sa.Connection, table: sa.Table, rows: Sequence[Mapping[str, Any]]
-) -> list[int]:
-    """Insert rows and return their ids in the same order."""
-    if not rows:
-        return []
-    statement = sa.insert(table).returning(table.c.id, sort_by_parameter_order=True)
-    return list(connection.scalars(statement, [dict(row) for row in rows]))
 
 
 def find_robot(connection: sa.Connection, name: str) -> int:
@@ -87,8 +78,13 @@ def keep_robot(connection: sa.Connection, name: str, profile: Robot | None) -> i
 def find_locked(connection: sa.Connection, name: str) -> int:
     """Return the row of a known robot and keep other writers from it meanwhile."""
     row = find_robot(connection, name)
-    connection.execute(sa.select(robots.c.id).where(robots.c.id == row).with_for_update())
+    lock_robot(connection, row)
     return row
+
+
+def lock_robot(connection: sa.Connection, row: int) -> None:
+    """Keep other writers from a robot until the transaction ends."""
+    connection.execute(sa.select(robots.c.id).where(robots.c.id == row).with_for_update())
 
 
 def _keep_profile(connection: sa.Connection, row: int, robot: Robot) -> None:
@@ -141,8 +137,8 @@ def keep_log(connection: sa.Connection, robot: int, log: LogFile) -> int:
 
 def keep_runs(
     connection: sa.Connection, log: int, names: Sequence[str], details: Sequence[Any]
-) -> tuple[list[int], set[int]]:
-    """Return the rows of the runs of a log, in its order, and which of them are new."""
+) -> tuple[list[int], int]:
+    """Return the rows of the runs of a log, in its order, and how many of them are new."""
     query = sa.select(runs.c.position, runs.c.name, runs.c.id).where(runs.c.log_id == log)
     known = {(one.position, one.name): one.id for one in connection.execute(query)}
     wanted = list(enumerate(map(storable, names)))
@@ -153,7 +149,18 @@ def keep_runs(
     ]
     added = add_rows(connection, runs, rows)
     known |= {(one["position"], one["name"]): row for one, row in zip(rows, added, strict=True)}
-    return [known[key] for key in wanted], set(added)
+    return [known[key] for key in wanted], len(added)
+
+
+# Sessions.
+
+
+def add_session(connection: sa.Connection, robot: int, basis: Basis) -> int:
+    """Return the row of a new session."""
+    stated: dict[str, Any] = {"robot_id": robot, "calibration_id": basis.calibration}
+    stated |= {"begun": datetime.now(UTC), "version": __version__, "command": basis.command}
+    stated |= {"method": basis.method, "protocol": basis.protocol}
+    return add_rows(connection, sessions, [stated])[0]
 
 
 # Diagnoses.
@@ -168,36 +175,36 @@ def new_diagnoses(
     diagnoses: Sequence[Diagnosis],
     run_rows: Sequence[int],
     calibration: int | None,
-) -> Kept:
-    """Return the diagnoses that are not stored yet."""
+) -> tuple[Kept, set[int]]:
+    """Return the diagnoses that are not stored yet, and the runs that have one already."""
     known = _stored_digests(connection, log)
     each = [
         (one, row, _digest_of(one, calibration))
         for one, row in zip(diagnoses, run_rows, strict=True)
     ]
-    return [one for one in each if (one[1], one[2]) not in known]
+    return [one for one in each if (one[1], one[2]) not in known], {row for row, _ in known}
 
 
 def add_diagnoses(
-    connection: sa.Connection, robot: int, kept: Kept, at: datetime, calibration: int | None
+    connection: sa.Connection, rows: SessionRows, kept: Kept, at: datetime
 ) -> list[int]:
-    """Store diagnoses as a session of their own, and return their rows."""
-    if not kept:
-        return []
-    session = _new_session(connection, robot, kept[0][0], calibration)
-    of = {"robot_id": robot, "session_id": session}
-    rows = [{**_diagnosis_row(one, digest, at), **of, "run_id": run} for one, run, digest in kept]
-    return add_rows(connection, diagnoses, rows)
+    """Store diagnoses of runs, and return their rows."""
+    of = {"robot_id": rows.robot, "session_id": rows.session}
+    stated = [{**_diagnosis_row(one, digest, at), **of, "run_id": run} for one, run, digest in kept]
+    return add_rows(connection, diagnoses, stated)
 
 
-def _new_session(
-    connection: sa.Connection, robot: int, first: Diagnosis, calibration: int | None
-) -> int:
-    """Return the row of a new session of diagnosis."""
-    stated: dict[str, Any] = {"robot_id": robot, "calibration_id": calibration}
-    stated |= {"begun": datetime.now(UTC)}
-    stated |= {"version": __version__, "method": first.method, "protocol": first.protocol}
-    return add_rows(connection, sessions, [stated])[0]
+def add_session_diagnoses(
+    connection: sa.Connection,
+    rows: SessionRows,
+    found: Sequence[tuple[datetime, Diagnosis | None]],
+) -> list[int | None]:
+    """Store diagnoses of the run of a session over time, and return their rows in that order."""
+    of = {"robot_id": rows.robot, "session_id": rows.session, "run_id": rows.run}
+    kept = [(at, one) for at, one in found if one is not None]
+    stated = [{**_diagnosis_row(one, _digest_of(one, None), at), **of} for at, one in kept]
+    added = iter(add_rows(connection, diagnoses, stated))
+    return [None if one is None else next(added) for _, one in found]
 
 
 def _digest_of(diagnosis: Diagnosis, calibration: int | None) -> str:
@@ -260,7 +267,7 @@ def tracker_of(connection: sa.Connection, robot: int) -> EpisodeTracker:
 
 
 def keep_episodes(
-    connection: sa.Connection, robot: int, changed: Sequence[Course], rows: Sequence[int]
+    connection: sa.Connection, robot: int, changed: Sequence[Course], rows: Sequence[int | None]
 ) -> list[int]:
     """Write new and closed episodes and their events; `rows` are those of the diagnoses.
 

@@ -6,6 +6,7 @@ the others alone (`LifeFilter`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
@@ -21,6 +22,7 @@ from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.set_ups.setup_prior import SetupPrior
+from failuretwin.inference.together.life_filter import LifeFilter
 
 RUN = 5
 """Movements of a run that is learned from at first: as many as a run of the paper has."""
@@ -41,18 +43,29 @@ class LifeLearner:
 
     Args:
         diagnoser: The method, with its hypotheses and priors.
+        resumed: Returns what to begin with in place of what arms of its kind are like.
     """
 
-    def __init__(self, diagnoser: BayesDiagnoser) -> None:
+    def __init__(
+        self,
+        diagnoser: BayesDiagnoser,
+        resumed: Callable[[LifeFilter], LifeFilter] = lambda start: start,
+    ) -> None:
         known = replace(diagnoser.priors, setup=SetupPrior.known())
         self._diagnoser = replace(diagnoser, priors=known)
-        self._life = begin(self._diagnoser, cold=True)
+        self._life = resumed(begin(self._diagnoser, cold=True))
         self._waiting: list[SettledEvidence] = []
         self._told: Movements | None = None
         self._worker = ThreadPoolExecutor(1, "learning")
         self._work: Future[None] | None = None
-        self.model = self._life.model
-        self.movements = 0
+        self.movements = self._life.movements
+        self.model = self._model() if self.movements else self._life.model
+
+    @property
+    def life(self) -> LifeFilter:
+        """What is believed by now, once the last run is learned."""
+        self._finish()
+        return self._life
 
     def take(self, movement: SettledEvidence, learns: bool) -> bool:
         """Take in a finished movement and return whether the model has changed.

@@ -7,7 +7,7 @@ the robot itself teaches (`HealthyMixture`, `LifeLearner`); the alarm comes from
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +25,7 @@ from failuretwin.decision.streaming.trouble import DEAD, rests_throughout
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import FITS, misfit
 from failuretwin.inference.movements.healthy_density import healthy_log_density
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -34,6 +35,7 @@ from failuretwin.inference.observation.rounding import rounded, told_of
 from failuretwin.inference.posterior import StreamPosition
 from failuretwin.inference.together.fault_filter import FaultFilter
 from failuretwin.inference.together.healthy_mixture import FOREIGN, HealthyMixture
+from failuretwin.inference.together.life_filter import LifeFilter
 
 WORTH_LEARNING = 0.01
 """Probability that the calibration that was given is not this robot's from which it learns."""
@@ -87,6 +89,8 @@ class FaultMonitor(RobotStream):
     Args:
         diagnoser: The method, with its hypotheses and healthy behaviour.
         false_alarms_per_100h: False alarms that are allowed in 100 hours of work.
+        resumed: Returns what earlier watches have learned of the robot, given what its kind is
+            like.
 
     Raises:
         InputError: If the budget makes no sense, or a hypothesis cannot be followed.
@@ -96,12 +100,13 @@ class FaultMonitor(RobotStream):
         self,
         diagnoser: BayesDiagnoser,
         false_alarms_per_100h: float = 1.0,
+        resumed: Callable[[LifeFilter], LifeFilter] = lambda start: start,
     ) -> None:
         super().__init__(StreamingFleet(diagnoser, 1))
         known = diagnoser.healthy_model
         ideal, cold = known.imperfections.settling is None, known.imperfections.name == GENERIC_NAME
         learns = known.sensors.tool_alone and not ideal
-        self._learner = LifeLearner(diagnoser) if learns else None
+        self._learner = LifeLearner(diagnoser, resumed) if learns else None
         self._models: list[HealthyModel] = [] if cold and learns else [known]
         if self._learner is not None:
             self._models.append(self._learner.model)
@@ -122,6 +127,8 @@ class FaultMonitor(RobotStream):
         self._set_up = SetUpWatch(diagnoser)
         self._arrived = np.full((0, len(known.scatter)), np.nan)
         self._rests, self._misfit = False, 0.0
+        if len(self._models) == 1 and self._learner is not None and self._learner.movements:
+            self._adopt_learned()
 
     @property
     def set_up(self) -> str | None:
@@ -139,6 +146,11 @@ class FaultMonitor(RobotStream):
         fits = float(np.exp(self._concluded.log_weight[0, 0])) if self._given else 0.0
         learned = 0 if self._learner is None else self._learner.movements
         return Fit(self._given, fits, learned, self._set_up.movements)
+
+    @property
+    def life(self) -> LifeFilter | None:
+        """What the robot itself has taught, to go on from; None: it is not learned."""
+        return None if self._learner is None else self._learner.life
 
     @property
     def believed(self) -> Believed:
@@ -270,8 +282,12 @@ class FaultMonitor(RobotStream):
         if self._learner.take(replace(one, movements=told), learns=own > WORTH_LEARNING):
             self._models[-1] = rounded(self._learner.model, self._fleet.rounding, None)
             if own > 0.5:
-                self._fleet.adopt(self._models[-1].imperfections)
-                self._models[-1] = self._fleet.model
+                self._adopt_learned()
+
+    def _adopt_learned(self) -> None:
+        """Estimate by what the robot itself has taught."""
+        self._fleet.adopt(self._models[-1].imperfections)
+        self._models[-1] = self._fleet.model
 
 
 def monitor(
@@ -279,6 +295,8 @@ def monitor(
     imperfections: HealthyLike = None,
     false_alarms_per_100h: float = 1.0,
     sensing: str | None = None,
+    resumed: Callable[[LifeFilter], LifeFilter] = lambda start: start,
+    priors: Priors | None = None,
 ) -> FaultMonitor:
     """Return what watches a robot at work: settled poses, and faults are rare.
 
@@ -288,6 +306,9 @@ def monitor(
             None: as its profile says.
         false_alarms_per_100h: False alarms that are allowed in 100 hours of work.
         sensing: ``tool``, with ``+encoders``, ``+goals`` or both; None: the tool's position alone.
+        resumed: Returns what earlier watches have learned of the robot, given what its kind is
+            like.
+        priors: Beliefs about faults; None: the usual ones.
     """
-    diagnoser = BayesDiagnoser(twin, imperfections, whole_run=False, sensing=sensing)
-    return FaultMonitor(diagnoser, false_alarms_per_100h)
+    diagnoser = BayesDiagnoser(twin, imperfections, priors=priors, whole_run=False, sensing=sensing)
+    return FaultMonitor(diagnoser, false_alarms_per_100h, resumed)

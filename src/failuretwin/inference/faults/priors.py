@@ -7,12 +7,14 @@ Section: docs/inference.md#priors
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.arm_classes import class_of
@@ -202,6 +204,8 @@ class Priors:
         healthy_odds: How many times as probable it is that all is well as its mode
             says, which leaves no more for it than for a stuck motor.
         setup: How far the set-up of the sensor may be off.
+        fault_factors: How many times as probable a fault is as its mode says, by
+            ``MOTOR:MODE``; faults that are left out: as their mode says.
 
     Raises:
         InputError: If there is no range, or one or the odds make no sense.
@@ -211,6 +215,7 @@ class Priors:
     error_ranges: Sequence[Range] | Mapping[str, Sequence[Range]] | None = None
     healthy_odds: float = 1.0
     setup: SetupPrior = field(default_factory=SetupPrior)
+    fault_factors: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for ranges in self._stated:
@@ -220,6 +225,11 @@ class Priors:
                 )
         if not 0.0 < self.healthy_odds < np.inf:
             raise InputError(f"healthy_odds are {self.healthy_odds:g}, expected above 0.")
+
+    def factor_of(self, hypothesis: Hypothesis) -> float:
+        """Return how many times as probable a hypothesis is as its modes say."""
+        known = (self.fault_factors.get(str(fault), 1.0) for fault in hypothesis.faults)
+        return math.prod(known, start=1.0)
 
     @property
     def _stated(self) -> Sequence[Sequence[Range]]:

@@ -264,7 +264,8 @@ class FaultFilter:
         odds = np.array([0.0 if h.is_healthy else prior_odds(h) for h in self.hypotheses])
         motors = ["" if h.is_healthy else h.faults[0].motor for h in self.hypotheses]
         total = np.array([odds[[m == motor for m in motors]].sum() for motor in motors])
-        return self.rates.faults_per_1000_h / 1000.0 * odds / np.maximum(total, LEAST)
+        learned = odds * [self.priors.factor_of(h) for h in self.hypotheses]
+        return self.rates.faults_per_1000_h / 1000.0 * learned / np.maximum(total, LEAST)
 
     @cached_property
     def _grids(self) -> list[FloatArray]:

@@ -1,0 +1,128 @@
+"""Rates of faults that a fleet teaches: Gamma-Poisson over the table's priors.
+
+    lambda ~ Gamma(w, w / lambda_0),   n | lambda ~ Poisson(lambda T)
+    lambda | n ~ Gamma(w + n, w / lambda_0 + T)
+
+with the rate of the table lambda_0, n confirmed faults in a robot time of T, and the weight w of
+the table in faults.
+
+Section: docs/store.md#learned-rates-of-faults
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.stats import gamma
+
+from failuretwin.core.errors import counted
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.types import FloatArray
+from failuretwin.inference.posterior import prior_odds
+from failuretwin.inference.together.fault_filter import RATES
+
+if TYPE_CHECKING:
+    from failuretwin.data_knowledge.records.queries import FleetFaults
+
+WEIGHT = 2.0
+"""Faults that the table counts as; assumed. A single confirmation multiplies the odds of a fault by
+1 + 1 / w = 1.5 at most."""
+INTERVAL = 0.9
+
+
+@dataclass(frozen=True)
+class FaultRate:
+    """Rate of a fault: posterior of lambda.
+
+    Attributes:
+        name: ``MOTOR:MODE``.
+        table_per_h: Rate of the table lambda_0 [1/h].
+        confirmed: Confirmed faults n.
+        hours: Robot time T [h].
+    """
+
+    name: str
+    table_per_h: float
+    confirmed: int
+    hours: float
+
+    @property
+    def mean_per_h(self) -> float:
+        """Posterior mean [1/h]."""
+        return (WEIGHT + self.confirmed) / (WEIGHT / self.table_per_h + self.hours)
+
+    @property
+    def factor(self) -> float:
+        """Posterior mean over the rate of the table."""
+        return self.mean_per_h / self.table_per_h
+
+    @property
+    def interval_per_h(self) -> FloatArray:
+        """Interval of 90 %, low and high [1/h]."""
+        ends = 0.5 + 0.5 * INTERVAL * np.array([-1.0, 1.0])
+        scale = 1.0 / (WEIGHT / self.table_per_h + self.hours)
+        return np.asarray(gamma.ppf(ends, WEIGHT + self.confirmed, scale=scale))
+
+
+def table_rates(hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
+    """Return the rate of each single fault by the table [1/h]: a motor's, shared by its modes."""
+    single = [h.faults[0] for h in hypotheses if h.known and len(h.faults) == 1]
+    odds = {str(fault): prior_odds(Hypothesis((fault,))) for fault in single}
+    total: dict[str, float] = {}
+    for fault in single:
+        total[fault.motor] = total.get(fault.motor, 0.0) + odds[str(fault)]
+    each_per_h = RATES.faults_per_1000_h / 1000.0
+    return {str(fault): each_per_h * odds[str(fault)] / total[fault.motor] for fault in single}
+
+
+@dataclass(frozen=True)
+class LearnedRates:
+    """Rates of faults of a kind of robot.
+
+    Attributes:
+        seen: The faults that they rest on.
+        rates: The rate of each fault.
+    """
+
+    seen: FleetFaults
+    rates: Sequence[FaultRate]
+
+    @classmethod
+    def of(cls, seen: FleetFaults, hypotheses: Sequence[Hypothesis]) -> LearnedRates:
+        """Return the rates of the single faults among some hypotheses."""
+        table = table_rates(hypotheses)
+        rates = [FaultRate(k, v, seen.confirmed.get(k, 0), seen.hours) for k, v in table.items()]
+        return cls(seen, rates)
+
+    @property
+    def factors(self) -> dict[str, float]:
+        """How many times as probable each fault is as by the table."""
+        return {rate.name: rate.factor for rate in self.rates}
+
+    @property
+    def line(self) -> str:
+        """What they rest on, in a line."""
+        seen, most = self.seen, max(self.rates, key=lambda rate: rate.mean_per_h, default=None)
+        of = f"{sum(seen.confirmed.values())} confirmed of {counted(seen.robots, 'robot')}"
+        told = f"learned priors: {of} ({seen.kind}) in {seen.hours / 24.0:.0f} robot days"
+        if most is None or not seen.confirmed:
+            return told
+        low, high = 1000.0 * most.interval_per_h
+        return (
+            f"{told}; most often {most.name}, {1000.0 * most.mean_per_h:.2g} in 1000 h "
+            f"({low:.2g} to {high:.2g}), {most.factor:.2g} times the table's rate"
+        )
+
+
+def reweighted(posterior: Mapping[str, float], factors: Mapping[str, float]) -> dict[str, float]:
+    """Return a posterior under other priors: the odds of each fault times its factor."""
+    parsed = {name: Hypothesis.parse(name).faults for name in posterior}
+    weight = {
+        name: value * float(np.prod([factors.get(str(fault), 1.0) for fault in parsed[name]]))
+        for name, value in posterior.items()
+    }
+    total = sum(weight.values())
+    return {name: value / total for name, value in weight.items()}

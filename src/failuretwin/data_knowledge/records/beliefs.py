@@ -1,0 +1,140 @@
+"""Posteriors of theta: what is believed of a robot after a session, to go on from.
+
+Each session adds a row; the posterior of the last one is the prior of the next. A row goes on from
+those with the same follower, start and version, and holds its new runs alone.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import sqlalchemy as sa
+
+from failuretwin import __version__
+from failuretwin.core.errors import InputError, OutputError
+from failuretwin.data_knowledge.records.rows import SessionRows, add_rows
+from failuretwin.data_knowledge.records.schema import beliefs, sessions
+
+Arrays = Mapping[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class BeliefLine:
+    """A line of beliefs that go on from each other.
+
+    Attributes:
+        follower: What follows the robot: ``diagnose`` or ``watch``.
+        start: What was believed before any run, as a checksum.
+    """
+
+    follower: str
+    start: str
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is believed of a robot after a session.
+
+    Attributes:
+        runs: Number of runs that it has learned from.
+        arrays: The state, by name.
+        rows: What is kept of each new run, the oldest first.
+        after: Number of the belief that it goes on from; None: the line is new.
+    """
+
+    runs: int
+    arrays: Arrays
+    rows: Sequence[Mapping[str, Any]]
+    after: int | None = None
+
+
+@dataclass(frozen=True)
+class StoredBelief:
+    """A belief of the store.
+
+    Attributes:
+        number: Its number in the store.
+        runs: Number of runs that it has learned from.
+        arrays: The state, by name.
+        rows: What is kept of each run of its line, the oldest first.
+    """
+
+    number: int
+    runs: int
+    arrays: Arrays
+    rows: tuple[dict[str, Any], ...]
+
+
+def read_belief(connection: sa.Connection, robot: int, line: BeliefLine) -> StoredBelief | None:
+    """Return the last belief of a line; None: the line is new.
+
+    Raises:
+        InputError: If it is damaged.
+    """
+    query = sa.select(beliefs).join(sessions).where(_of(robot, line)).order_by(beliefs.c.id)
+    found = connection.execute(query).all()
+    if not found:
+        return None
+    rows = tuple(row for one in found for row in one.rows)
+    return StoredBelief(found[-1].id, found[-1].runs, _unpacked(found[-1].arrays), rows)
+
+
+def _of(robot: int, line: BeliefLine) -> sa.ColumnElement[bool]:
+    return sa.and_(
+        beliefs.c.robot_id == robot,
+        beliefs.c.follower == line.follower,
+        beliefs.c.start == line.start,
+        sessions.c.version == __version__,
+    )
+
+
+def other_line(connection: sa.Connection, robot: int, line: BeliefLine) -> str:
+    """Return why the last belief of another line is not used; empty: there is none."""
+    query = sa.select(beliefs.c.start, beliefs.c.runs, sessions.c.version).join(sessions)
+    of = beliefs.c.robot_id == robot, beliefs.c.follower == line.follower
+    last = connection.execute(query.where(*of).order_by(beliefs.c.id.desc()).limit(1)).first()
+    if last is None:
+        return ""
+    if last.start == line.start:
+        return f"failuretwin {last.version} made it, and this is {__version__}"
+    return "it began with another calibration"
+
+
+def add_belief(
+    connection: sa.Connection, rows: SessionRows, line: BeliefLine, belief: Belief
+) -> None:
+    """Store what is believed now as the end of a line; the robot is locked.
+
+    Raises:
+        OutputError: If another session went on from the same belief.
+    """
+    last = sa.select(sa.func.max(beliefs.c.id)).join(sessions).where(_of(rows.robot, line))
+    if connection.scalar(last) != belief.after:
+        raise OutputError(
+            "another session has followed this robot since its belief was read. Nothing of this "
+            "was stored. Run the command again."
+        )
+    stated: dict[str, Any] = {"follower": line.follower, "start": line.start, "runs": belief.runs}
+    stated |= {"rows": [dict(row) for row in belief.rows], "arrays": _packed(belief.arrays)}
+    add_rows(connection, beliefs, [{**stated, "robot_id": rows.robot, "session_id": rows.session}])
+
+
+def _packed(arrays: Arrays) -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, allow_pickle=False, **arrays)
+    return file.getvalue()
+
+
+def _unpacked(content: bytes) -> dict[str, npt.NDArray[Any]]:
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (ValueError, OSError, KeyError) as error:
+        raise InputError(
+            f"a belief in the store is damaged ({error}). Restore the store from a copy."
+        ) from error

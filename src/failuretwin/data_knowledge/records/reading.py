@@ -1,0 +1,116 @@
+"""Reading from a store: robots, histories, questions, exports, checks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import sqlalchemy as sa
+
+from failuretwin.data_knowledge.records import CHECK_DAYS, writing
+from failuretwin.data_knowledge.records.beliefs import (
+    BeliefLine,
+    StoredBelief,
+    other_line,
+    read_belief,
+)
+from failuretwin.data_knowledge.records.checking import StoreCheck, checked
+from failuretwin.data_knowledge.records.database import Database
+from failuretwin.data_knowledge.records.export import export_parquet
+from failuretwin.data_knowledge.records.history import History, StoredCalibration, read_history
+from failuretwin.data_knowledge.records.queries import FleetFaults, QueryAnswer, ask, fleet_faults
+from failuretwin.data_knowledge.records.schema import robots
+from failuretwin.data_knowledge.records.statements import calibration_in_force
+
+
+class StoreReader:
+    """The part of a store that only reads.
+
+    Args:
+        database: The database with the tables.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    @property
+    def name(self) -> str:
+        """Path of the SQLite file, or URL without the password."""
+        return self._database.name
+
+    def calibration(self, robot: str) -> StoredCalibration | None:
+        """Return the calibration of a robot that is in force.
+
+        None: the robot has none, or the store does not know the robot.
+        """
+        with self._database.reading() as connection:
+            row = _row_of(connection, robot)
+            return None if row is None else calibration_in_force(connection, row)
+
+    def belief(self, robot: str, line: BeliefLine) -> tuple[StoredBelief | None, str]:
+        """Return the last belief of a line, and why that of another line is not used.
+
+        Raises:
+            InputError: If it is damaged.
+        """
+        with self._database.reading() as connection:
+            row = _row_of(connection, robot)
+            if row is None:
+                return None, ""
+            found = read_belief(connection, row, line)
+            return found, "" if found else other_line(connection, row, line)
+
+    def robots(self) -> list[str]:
+        """Return the names of all robots, sorted."""
+        with self._database.reading() as connection:
+            return sorted(connection.scalars(sa.select(robots.c.name)))
+
+    def history(self, robot: str) -> History:
+        """Return what the store knows of a robot.
+
+        Raises:
+            InputError: If it does not know the robot.
+        """
+        with self._database.reading() as connection:
+            return read_history(connection, writing.find_robot(connection, robot), robot)
+
+    def query(self, name: str, days: float = CHECK_DAYS) -> QueryAnswer:
+        """Return the answer to a ready question.
+
+        Args:
+            name: ``failing-motors``, ``time-between-failures``, ``wrong-diagnoses`` or ``due``.
+            days: Time without a run after which a robot is due [days].
+
+        Raises:
+            InputError: If there is no such question.
+        """
+        with self._database.reading() as connection:
+            return ask(connection, name, days)
+
+    def fleet_faults(self, kind: str) -> FleetFaults:
+        """Return the confirmed faults of all robots of a kind, and the time that they were seen.
+
+        Args:
+            kind: Name of their profile.
+        """
+        with self._database.reading() as connection:
+            return fleet_faults(connection, kind)
+
+    def export(self, folder: str | Path) -> dict[str, int]:
+        """Write every table to ``TABLE.parquet`` in a folder, and return the numbers of rows.
+
+        Raises:
+            InputError: If pyarrow is missing.
+            OutputError: If they cannot be written; the folder is as before.
+        """
+        with self._database.reading() as connection:
+            return export_parquet(connection, Path(folder))
+
+    def check(self) -> StoreCheck:
+        """Check the database, and whether each log is where it was and as it was."""
+        with self._database.reading() as connection:
+            return checked(connection)
+
+
+def _row_of(connection: sa.Connection, robot: str) -> int | None:
+    """Return the row of a robot; None: the store does not know it."""
+    return connection.scalar(sa.select(robots.c.id).where(robots.c.name == robot))

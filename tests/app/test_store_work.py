@@ -1,0 +1,295 @@
+"""Work of `watch`, `check`, `act` and `import` in a store, and robots followed day by day."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+import failuretwin as ft
+from failuretwin.app.remembering import RobotRecord
+from failuretwin.app.shadow import Change, Snapshot
+from failuretwin.app.watch_keeper import begin_watch
+from failuretwin.connection.links.base import OK, Answer
+from failuretwin.core.hypothesis import ALL_CLEAR, RAISED, Alarm
+from failuretwin.data_knowledge.records.rows import Basis
+from failuretwin.data_knowledge.store import load_run_set, save_run_set
+from store_places import diagnosis
+
+NAME = ("--robot-name", "arm_7")
+FAULT = ("--fault", "motor_3:stuck@20-40")
+
+
+@pytest.fixture
+def store(place):
+    return ft.open_store(place.url, create=True)
+
+
+@pytest.fixture
+def run(failuretwin, tmp_path):
+    """Run a command that must work in a folder of its own."""
+
+    def call(*words, code=0):
+        answer = failuretwin(*words, folder=tmp_path)
+        assert answer.returncode == code, answer.stdout + answer.stderr
+        return answer
+
+    return call
+
+
+@pytest.fixture
+def calibrated(store, armpi):
+    """A calibration of the arm in the store."""
+    document = armpi.imperfections_file.read_text("utf-8")
+    store.keep_calibration("arm_7", document, name="armpi_fpv", protocol="P0c", profile=armpi)
+
+
+FOUND = "calibration of arm_7 from the store: armpi_fpv, valid from"
+
+
+def texts(history, kind):
+    return [one.text for one in history.timeline if one.kind == kind]
+
+
+def test_work_of_every_command_is_in_the_history(run, store, place, calibrated, tmp_path):
+    words = ("--store", place.url, *NAME)
+    watch = run("watch", "emulated", "--speed", 0, "--seconds", 55, *FAULT, *words)
+    assert FOUND in watch.stderr
+    lines = [line.partition(" s  ")[2] for line in watch.stdout.splitlines() if " s  " in line]
+    stored = texts(store.history("arm_7"), "watch")
+    assert stored[1:-1] == lines
+    assert (stored[0], stored[-1][:9]) == ("begins: emulated", "ends: OK:")
+    assert [line.partition(":")[0] for line in lines if line[:2] in ("AL", "CL")] == [
+        "ALARM",
+        "CLEARED",
+    ]
+    assert [(one.motor, one.state) for one in store.history("arm_7").episodes] == [
+        ("motor_3", "cleared")
+    ]
+
+    (tmp_path / "task.csv").write_text("x,y,z\n0.15,0.0,0.15\n")
+    act = run("act", "task.csv", *words)
+    assert FOUND in act.stderr
+    assert act.stdout.count("remembered in") == 1
+    (done,) = texts(store.history("arm_7"), "act")
+    assert done.startswith("target (0.150, 0.000, 0.150) m: reached after")
+
+    check = run("check", "--seconds", 14, *words)
+    assert FOUND in check.stderr
+    assert check.stdout.endswith(": 1 check of arm_7\n")
+    assert len(texts(store.history("arm_7"), "check")) == 1
+    rows = place.sql("SELECT count(*) FROM offsets WHERE name IN ('zero', 'play')")
+    assert rows == [("8",)]
+
+    told = run("import", ft.sample_log(), "--out", "out.nc", *words)
+    assert told.stdout.endswith("3 runs of arm_7\n")
+    assert texts(store.history("arm_7"), "import") == ["3 runs written to out.nc"]
+    rows = place.sql("SELECT command, calibration_id FROM sessions ORDER BY id")
+    assert rows == [("watch", "1"), ("act", "1"), ("check", "1"), ("import", "")]
+    assert store.check().problems == ()
+
+
+def test_a_check_that_was_recorded_is_stored_with_its_log(run, store, place):
+    log = ("--log", ft.sample_log(), "--store", place.url, *NAME)
+    told = run("check", *log, "--recorded", "2026-03-02")
+    assert ": 3 checks of arm_7\n" in told.stdout
+    assert place.sql("SELECT count(DISTINCT run_id) FROM diagnoses") == [("3",)]
+    again = run("check", *log, "--recorded", "2026-03-02")
+    assert ": 0 checks of arm_7, 3 known before\n" in again.stdout
+
+
+def test_what_a_killed_watch_has_told_is_stored(store, place, tmp_path):
+    command = [sys.executable, "-m", "failuretwin", "watch", "emulated", "--speed", "0"]
+    command += [*FAULT, "--store", place.url, *NAME]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as child:
+        told = []
+        while not told or "ALARM" not in told[-1]:
+            told.append(child.stdout.readline())
+            assert told[-1]
+        os.kill(child.pid, signal.SIGKILL)
+    lines = [line.strip().partition(" s  ")[2] for line in told if " s  " in line]
+    stored = texts(store.history("arm_7"), "watch")
+    assert stored[1 : 1 + len(lines)] == lines
+    assert [one.state for one in store.history("arm_7").episodes] == ["raised"]
+    assert store.check().problems == ()
+
+
+# The keeper of a watch.
+
+HEALTHY = Answer(1.0, OK, diagnosis("stream", "healthy"), ALL_CLEAR)
+STUCK = Answer(2.0, OK, diagnosis("stream", "motor_1:stuck"), Alarm(RAISED, "motor_1:stuck"))
+
+
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "robots.db"
+
+
+def keeper_of(file, armpi):
+    record = RobotRecord(ft.open_store(file), "arm_7", armpi)
+    return begin_watch(record, "ros1", Basis("watch"), None)
+
+
+def test_a_store_that_is_locked_delays_what_is_stored_and_loses_nothing(file, armpi, monkeypatch):
+    store = ft.open_store(file, create=True)
+    monkeypatch.setattr("failuretwin.data_knowledge.records.database.PATIENCE_S", 0.05)
+    monkeypatch.setattr("failuretwin.app.watch_keeper.RETRY_S", 0.0)
+    keeper = keeper_of(file, armpi)
+    with closing(sqlite3.connect(file, isolation_level=None)) as holder:
+        holder.execute("BEGIN IMMEDIATE")
+        keeper.keep([Change(1.0, "OK: healthy")], HEALTHY)
+        assert "changes wait until they can be stored" in keeper.trouble
+        assert "\n" not in keeper.trouble
+        holder.execute("ROLLBACK")
+    keeper.keep([Change(2.0, "ALARM: motor 1 stuck")], STUCK)
+    assert keeper.trouble == ""
+    stored = texts(store.history("arm_7"), "watch")
+    assert stored == ["begins: ros1", "OK: healthy", "ALARM: motor 1 stuck"]
+    assert [one.state for one in store.history("arm_7").episodes] == ["raised"]
+
+
+def test_an_undecided_end_clears_no_episode(file, armpi):
+    store = ft.open_store(file, create=True)
+    keeper_of(file, armpi).keep([Change(2.0, "ALARM: motor 1 stuck")], STUCK)
+    nothing = np.full(3, np.nan)
+    keeper_of(file, armpi).end(Snapshot(HEALTHY, 3.0, nothing, 0.0), decided=False)
+    assert [one.state for one in store.history("arm_7").episodes] == ["raised"]
+    keeper_of(file, armpi).end(Snapshot(HEALTHY, 3.0, nothing, 0.0), decided=True)
+    assert [one.state for one in store.history("arm_7").episodes] == ["cleared"]
+
+
+# Going on from yesterday.
+
+
+@pytest.fixture(scope="module")
+def days(simulated, tmp_path_factory):
+    """Two logs of four runs each, recorded on two days."""
+    folder = tmp_path_factory.mktemp("days")
+    runs = load_run_set(simulated).drop_vars("fault")
+    for number in range(2):
+        part = [0, 1, 0, 5] if number else [0, 0, 2, 0]
+        names = [f"day {number}, run {k}" for k in range(4)]
+        own = runs.isel(run=part).assign_coords(run=names)
+        own["measured"] = own["measured"] + 1e-5 * np.arange(4)[:, None, None]
+        save_run_set(own, folder / f"day_{number}.nc")
+        os.utime(folder / f"day_{number}.nc", (0, 1_772_438_400 + 86_400 * number))
+    return folder
+
+
+def state_of(place):
+    """Return the arrays of the last belief, by numpy alone."""
+    digits = "hex(arrays)" if place.engine == "sqlite" else "encode(arrays, 'hex')"
+    ((blob,),) = place.sql(f"SELECT {digits} FROM beliefs ORDER BY id DESC LIMIT 1")
+    with np.load(io.BytesIO(bytes.fromhex(blob))) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+def test_a_robot_in_the_store_is_followed_as_by_files(
+    run, place, calibrated, days, armpi, tmp_path
+):
+    own = shutil.copy(armpi.imperfections_file, tmp_path / "cal.toml")
+    for number in range(2):
+        log = days / f"day_{number}.nc"
+        run("diagnose", log, "--track", "--calibration", own, "--csv", f"files_{number}.csv")
+        words = ("--store", place.url, *NAME, "--csv", f"store_{number}.csv")
+        told = run("diagnose", log, "--track", *words)
+        assert FOUND in told.stderr
+        assert "not used" not in told.stderr
+        same = [(tmp_path / f"{kind}_{number}.csv").read_text() for kind in ("files", "store")]
+        assert same[0] == same[1]
+    with np.load(tmp_path / "cal.history.npz") as kept:
+        files = {name: kept[name] for name in kept.files if name != "size"}
+    stored = state_of(place)
+    assert stored.keys() == files.keys()
+    for name, array in files.items():
+        np.testing.assert_array_equal(array, stored[name], err_msg=name)
+    again = run("diagnose", days / "day_0.nc", "--track", "--store", place.url, *NAME)
+    assert "0 runs learned, 8 in all, 4 known already" in again.stdout
+    assert place.sql("SELECT count(*), max(runs) FROM beliefs") == [("2", "8")]
+    told = run("history", "arm_7", "--store", place.url, "--report", "page").stdout
+    (line,) = (line for line in told.splitlines() if line.startswith("motor_2  compliance"))
+    page = (tmp_path / "page" / "index.html").read_text("utf-8")
+    for cell in line.split("  "):
+        assert cell.strip() in page
+
+
+def test_a_belief_of_another_calibration_is_not_used_and_begins_anew(run, file, days, armpi):
+    ft.open_store(file, create=True)
+    words = ("--track", "--store", file, *NAME)
+    run("diagnose", days / "day_0.nc", *words)
+    told = run("diagnose", days / "day_1.nc", *words, "--calibration", "armpi_fpv")
+    line = "what ... holds of arm_7 is not used: it began with another calibration. Beginning anew"
+    assert line.partition("... ")[2] in told.stderr
+    assert "4 runs learned, 4 in all" in told.stdout
+    back = run("diagnose", days / "day_1.nc", *words)
+    assert "not used" not in back.stderr
+    assert "4 runs learned, 8 in all" in back.stdout
+
+
+def test_a_self_calibration_begins_with_that_of_the_store(run, place, calibrated, days, tmp_path):
+    log = days / "day_0.nc"
+    told = run("diagnose", log, "--self-calibrate", "--store", place.url, *NAME, "--csv", "a.csv")
+    assert FOUND in told.stderr
+    run("diagnose", log, "--self-calibrate", "--calibration", "armpi_fpv", "--csv", "b.csv")
+    assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
+
+
+def test_a_watch_goes_on_from_what_earlier_ones_have_learned(run, place, store):
+    words = ("watch", "emulated", "--speed", 0, "--seconds", 70, "--calibration", "generic")
+    first = run(*words, "--track", "--store", place.url, *NAME)
+    assert "0 runs of movements known before" in first.stdout
+    again = run(*words, "--seed", 1, "--track", "--store", place.url, *NAME)
+    rows = place.sql("SELECT runs FROM beliefs WHERE follower = 'watch' ORDER BY id")
+    known, now = (int(row[0]) for row in rows)
+    assert f"{known} runs of movements known before" in again.stdout
+    assert now > known > 0
+
+
+def test_tracking_a_watch_needs_a_store(run):
+    said = run("watch", "emulated", "--track", code=2).stderr
+    assert "--track needs a store. Name one: --store robots.db." in said
+
+
+def test_only_logs_were_recorded_before(run, file):
+    ft.open_store(file, create=True)
+    for words in (("watch", "emulated"), ("check",)):
+        said = run(*words, "--store", file, "--recorded", "2026-03-02", code=2).stderr
+        assert "only logs were recorded before: leave out --recorded" in said
+
+
+# Learned priors.
+
+
+def test_confirmed_faults_count_until_they_are_withdrawn(run, place, store, tmp_path):
+    words = ("--store", place.url, *NAME)
+    sample = ("diagnose", ft.sample_log(), "--json", "found.jsonl", *words)
+    run(*sample, "--recorded", "2026-03-02")
+    run("found", "arm_7", 1, "--confirmed", "--store", place.url)
+    told = run(*sample, "--recorded", "2026-03-02", "--learned-priors")
+    assert "learned priors: 1 confirmed of 1 robot (armpi_fpv) in 0 robot days; most" in told.stderr
+    record = json.loads((tmp_path / "found.jsonl").read_text().splitlines()[0])
+    assert record["method"].endswith("; learned priors")
+    run("advise", "--template", "costs.toml")
+    run("diagnose", ft.sample_log(), "--json", "plain.jsonl")
+    advice = ("advise", "plain.jsonl", "--costs", "costs.toml", "--store", place.url)
+    assert "learned priors: 1 confirmed" in run(*advice, "--learned-priors").stderr
+    run("found", "arm_7", 1, "--withdraw", "--store", place.url)
+    again = run(*sample, "--learned-priors")
+    assert "learned priors: 0 confirmed of 1 robot" in again.stderr
+    watch = ("watch", "emulated", "--speed", 0, "--seconds", 5, "--learned-priors", *words)
+    assert "learned priors: 0 confirmed of 1 robot" in run(*watch).stderr
+
+
+@pytest.mark.parametrize("command", [("diagnose", "a.nc"), ("watch", "emulated")])
+def test_learned_priors_need_a_store(run, command):
+    said = run(*command, "--learned-priors", code=2).stderr
+    assert "--learned-priors needs a store. Name one: --store robots.db." in said
