@@ -14,19 +14,24 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.geometry import Geometry, JointCorrection
+from failuretwin.digital_model.nonidealities import Readings
 from failuretwin.digital_model.robot import _assembled, load_robot
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.filter import filter_rows, refine
 from failuretwin.inference.engine.moments import moments_of
 from failuretwin.inference.engine.picks import Part, Picks, prepared
 from failuretwin.inference.engine.posterior import marginal_likelihoods, theta_posterior
+from failuretwin.inference.engine.redrawn_rows import redrawn_rows
 from failuretwin.inference.engine.registration import robot_posterior
 from failuretwin.inference.engine.rows import Scene
 from failuretwin.inference.engine.runs import RunsEvidence, has_rows
-from failuretwin.inference.engine.theta import layout_of, robot_components
+from failuretwin.inference.engine.theta import columns, layout_of, robot_components
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import log_prior
+from failuretwin.inference.together.folder_posterior import folder_posterior
+from failuretwin.inference.together.habits import Habits
 
 DRAWS = 20_000
 
@@ -158,17 +163,72 @@ def misbuilt():
     built = _assembled(replace(robot.profile, geometry=Geometry(moved)), robot.source)
     usual = generic_imperfections(robot)
     plan = Plan(built, ["healthy"], runs_per_class=12, seed=4, imperfections=usual)
-    return robot, simulate(plan)
+    return robot, simulate(plan), built
 
 
 def test_geometry_is_no_fault(misbuilt):
-    robot, made = misbuilt
+    robot, made, _ = misbuilt
     model = HealthyModel.of(load_calibration("generic", robot))
     hypotheses = [Hypothesis.parse("healthy")]
     hypotheses += [Hypothesis.parse(f"{name}:stuck") for name in robot.motor_names[:3]]
     hypotheses += [Hypothesis.parse(f"{robot.motor_names[1]}:steady_state_error")]
     told = probability(evidence_of(made, model, hypotheses))
     assert (told.argmax(axis=1) == 0).sum() >= 11
+
+
+def test_a_folder_learns_frames(misbuilt):
+    """Where the tool of the arm as it was built is, at poses that no run has seen."""
+    robot, made, built = misbuilt
+    model = HealthyModel.of(load_calibration("generic", robot))
+    seen = Evidence(made, model.settings, model.sensors).sound.settled
+    known = ft.Priors(setup=ft.SetupPrior.known())
+    found = folder_posterior(RunLikelihood(seen, model), [Hypothesis.parse("healthy")], known)
+    low, high = np.array([motor.movement_range for motor in robot.motors]).T
+    pose = np.random.default_rng(5).uniform(low, high, (200, len(low)))
+    still = np.zeros_like(pose)
+    G = columns(model, pose, still, still, layout_of(model.without_doubt))
+    off = ft.DigitalTwin(built).path(pose) - ft.DigitalTwin(robot).path(pose)
+    left = off - G @ found.mean
+    assert np.sqrt(np.mean(left**2)) < 0.5 * np.sqrt(np.mean(off**2))
+
+
+def test_noise_is_learned_where_nobody_has_measured_it(misbuilt):
+    """Half of what is assumed, as runs say; never below the least of such arms."""
+    robot, *_ = misbuilt
+    model = HealthyModel.of(load_calibration("generic", robot))
+    assert not model.knows_noise
+    for share, noise in ((0.5, 0.5 * model.path_noise), (1e-3, model.settings.least_noise_m)):
+        told = Habits.none(1, model)
+        told.precision[0, -1, -1], told.shift[0, -1] = 1e6, 1e6 * np.log(share)
+        told.precision[0, -2, -2], told.shift[0, -2] = 1e6, 1e6 * np.log(0.3)
+        habits = Habits.believed(model).plus(told)
+        found = habits.most_probable(model)
+        assert found.path_noise == pytest.approx(noise, rel=1e-3)
+        assert found.settling.tail_dof == pytest.approx(0.3 * model.settling.tail_dof, rel=1e-3)
+        assert habits.settled(found, model)
+        assert not habits.settled(model, model)
+        told.forget_tails(np.array([0]))
+        waits = Habits.believed(model).plus(told).most_probable(model)
+        assert waits.settling.tail_dof == model.settling.tail_dof
+        assert waits.path_noise == found.path_noise
+
+
+def test_errors_far_below_the_largest_have_nodes(misbuilt):
+    robot, made, _ = misbuilt
+    known = generic_imperfections(robot)
+    exact = replace(known, readings=Readings(10.0, noise_m=1e-5), variation=None)
+    model = HealthyModel(ft.DigitalTwin(robot), exact)
+    seen = Evidence(made, model.settings, model.sensors).sound
+    layout = layout_of(model)
+    V = robot_components(model, layout, False).covariance[0]
+    scene = Scene.of(model, moments_of(model, seen.settled), ft.Priors(), layout, V)
+    mode = MODES["steady_state_error"]
+    low, high = ft.Priors().sizes_of(mode, model, 0).ends
+    nodes = np.unique(np.abs(redrawn_rows(scene, 0, mode).size[:-1]))
+    nodes = nodes[np.isfinite(nodes)]
+    assert high > 200.0 * low
+    assert nodes.min() < 1.2 * low
+    assert (nodes[1:] / nodes[:-1]).max() < 1.4
 
 
 def test_hypotheses_without_rows():
