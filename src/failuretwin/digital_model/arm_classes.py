@@ -23,7 +23,9 @@ from failuretwin.digital_model.nonidealities import (
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, loads_in_range
 
-GENERIC_NAME = "generic, not calibrated"
+NOT_CALIBRATED = "not calibrated"
+"""Ending of the names of figures that are those of a class, not of one robot."""
+GENERIC_NAME = f"generic, {NOT_CALIBRATED}"
 """Name of the healthy behaviour in results of an uncalibrated robot."""
 
 

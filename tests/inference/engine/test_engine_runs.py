@@ -216,7 +216,8 @@ def test_noise_is_learned_where_nobody_has_measured_it(misbuilt):
 def test_errors_far_below_the_largest_have_nodes(misbuilt):
     robot, made, _ = misbuilt
     known = generic_imperfections(robot)
-    exact = replace(known, readings=Readings(10.0, noise_m=1e-5), variation=None)
+    own = Readings(10.0, noise_m=1e-5)
+    exact = replace(known, name="of this robot", readings=own, variation=None)
     model = HealthyModel(ft.DigitalTwin(robot), exact)
     seen = Evidence(made, model.settings, model.sensors).sound
     layout = layout_of(model)

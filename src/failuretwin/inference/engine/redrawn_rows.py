@@ -21,7 +21,8 @@ from failuretwin.inference.faults.priors import OnsetIntervals
 NODES, DECADE = 16, 8
 """Nodes of the size on each side of zero, in a constant ratio: at least, and in a factor of 10."""
 SMALLEST = 1e-2
-"""Smallest node, as a share of the largest size, where sizes begin at nothing."""
+"""Smallest node, as a share of the largest size, where sizes begin at nothing, or at what shows
+only once the noise of the sensor is found."""
 
 
 def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
@@ -29,8 +30,8 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
     moments, model = scene.moments, scene.model
     sizes = scene.priors.sizes_of(mode, model, motor)
     low, high = sizes.ends
-    smallest = low if low > 0.0 else SMALLEST * high
-    count = max(NODES, int(np.ceil(DECADE * np.log10(high / smallest))))
+    smallest = low if low > 0.0 and model.noise_is_found else max(low, SMALLEST * high)
+    count = max(NODES, round(DECADE * np.log10(high / smallest)))
     edge = np.geomspace(smallest, high, count + 1)
     node, width = np.sqrt(edge[1:] * edge[:-1]), np.diff(edge)
     size, width = np.r_[-node[::-1], node], np.r_[width[::-1], width]

@@ -237,7 +237,8 @@ def has_geometry(model: HealthyModel) -> bool:
     They do not show where the path is computed from motor readings. What they leave of a robot that
     was calibrated, or whose geometry was fitted, is in the scatter and the noise that were found.
     """
-    return model.sensors.tool_alone and not model.knows_noise
+    shows = model.sensors.tool_alone and model.twin.robot.profile.sensor_pose != "log"
+    return shows and not model.is_calibrated
 
 
 def layout_of(model: HealthyModel, moving: bool = False) -> Layout:

@@ -19,6 +19,7 @@ import numpy as np
 from failuretwin.core.movements import Movements, Stretches
 from failuretwin.core.numerics import Covariance, log_sum
 from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray
+from failuretwin.digital_model.arm_classes import NOT_CALIBRATED
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
 from failuretwin.digital_model.settling import Settling, loads_in_range, poses_in_range
@@ -183,6 +184,11 @@ class HealthyModel:
         """
         return float(np.hypot(self.noise_factor * self._usual_noise, self.untold_noise_m))
 
+    @property
+    def noise_is_found(self) -> bool:
+        """Whether runs of this very robot have told the noise of the sensor."""
+        return self.is_calibrated or self.noise_factor != 1.0
+
     def with_noise(self, factor: float) -> HealthyModel:
         """Return the same with a factor on the noise, which stays above the least of such arms."""
         least = min(self.settings.least_noise_m / self._usual_noise, self.noise_factor)
@@ -198,6 +204,12 @@ class HealthyModel:
         profile, known = self.twin.robot.profile, self.imperfections
         measured = profile.geometry.sensor_noise_m > 0.0 or known.readings is not None
         return measured or known.settling is None or profile.sensor_pose == "log"
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether this very robot was calibrated, or its geometry fitted."""
+        fitted = self.twin.robot.profile.geometry.sensor_noise_m > 0.0
+        return fitted or not self.imperfections.name.endswith(NOT_CALIBRATED)
 
     @property
     def _known_noise(self) -> float:
