@@ -152,8 +152,10 @@ def commander_of(arm: ArmOptions, known: CalibratedRobot, seed: int, stack: Exit
     if arm.place == EMULATED:
         return stack.enter_context(emulated_arm(known, arm.faults, seed))
     _refuse_faults(arm.faults, arm.place)
+    topics = load_topics(arm.topics)
+    topics.check_fits(known.robot)
     transport = stack.enter_context(open_transport(arm.place))
-    return RosCommander(known.robot, load_topics(arm.topics), transport)
+    return RosCommander(known.robot, topics, transport)
 
 
 def _refuse_faults(faults: Sequence[str], place: str) -> None:
@@ -190,6 +192,7 @@ def connect(
     _refuse_faults(live.faults, text)
     topics = load_topics(live.topics)
     if is_network(text):
+        topics.check_fits(robot)
         transport = stack.enter_context(open_transport(text))
         ros_link = RosCommander if takes_orders else RosSource
         diagnostics = RosSink(DiagnosticsWriter(robot, topics), transport)

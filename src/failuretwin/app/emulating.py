@@ -48,8 +48,9 @@ def obey(target: str, emulation: Emulation, live: LiveOptions) -> None:
             f"{live.speed:g}: stamps would not fit the movements. Leave out --speed."
         )
     topics, arm = load_topics(live.topics), EmulatedArm(emulation, Pace())
+    writer = RosWriter(emulation.robot, topics)
     with open_transport(target) as transport, until_interrupted():
-        sink = RosSink(RosWriter(emulation.robot, topics), transport)
+        sink = RosSink(writer, transport)
         orders = RosSource(emulation.robot, topics, transport)
         tell("an emulated robot obeys; stop with Ctrl-C")
         now, zero = 0.0, time.time()
@@ -101,8 +102,8 @@ def play(target: str, emulation: Emulation, live: LiveOptions) -> None:
 def _sink(target: str, emulation: Emulation, live: LiveOptions, stack: ExitStack) -> Sink:
     """Return the network or recording that an emulated robot publishes to; the stack closes it."""
     if is_network(target):
-        transport = stack.enter_context(open_transport(target))
-        return RosSink(RosWriter(emulation.robot, load_topics(live.topics)), transport)
+        writer = RosWriter(emulation.robot, load_topics(live.topics))
+        return RosSink(writer, stack.enter_context(open_transport(target)))
     from failuretwin.connection.links.recorder import Recorder
 
     return stack.enter_context(Recorder(Path(target), emulation.robot))

@@ -248,6 +248,7 @@ def _fitted(known: Sequence[CalibratedRobot], robot: Robot) -> Population:
         schedule=_schedule([one.schedule for one in each]),
         readings=_typical(readings) if readings else None,
         variation=stated_variation(np.concatenate([bias, *others]), settling, doubt),
+        of_class=True,
     )
     return Population(imperfections, tuple(_parameters(figures, imperfections, robot)), names)
 

@@ -256,6 +256,7 @@ def as_calibration(
             protocol="P1",
             readings=_readings(found.model, runs),
             variation=_variation(found),
+            of_class=False,
         ),
         parameters=tuple(parameters),
         sessions=tuple(dict.fromkeys(session_names(runs))),

@@ -23,9 +23,7 @@ from failuretwin.digital_model.nonidealities import (
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, loads_in_range
 
-NOT_CALIBRATED = "not calibrated"
-"""Ending of the names of figures that are those of a class, not of one robot."""
-GENERIC_NAME = f"generic, {NOT_CALIBRATED}"
+GENERIC_NAME = "generic, not calibrated"
 """Name of the healthy behaviour in results of an uncalibrated robot."""
 
 
@@ -122,6 +120,7 @@ def generic_imperfections(robot: Robot) -> Imperfections:
         settling=settling,
         lost_commands=_losses(robot, kind),
         variation=variation,
+        of_class=True,
     )
 
 

@@ -147,6 +147,7 @@ class Imperfections:
         readings: Tool sensor; None: a perfect sample at every grid time.
         variation: Differences from run to run; None: the same robot in every run.
         sensors: Calibrated sensors in addition to the tool's position.
+        of_class: Whether these are figures of a class of arms rather than of one robot.
     """
 
     name: str
@@ -159,6 +160,7 @@ class Imperfections:
     readings: Readings | None = None
     variation: Variation | None = None
     sensors: tuple[SensorProfile, ...] = ()
+    of_class: bool = False
 
     def __post_init__(self) -> None:
         if self.protocol not in PROTOCOLS:

@@ -19,7 +19,6 @@ import numpy as np
 from failuretwin.core.movements import Movements, Stretches
 from failuretwin.core.numerics import Covariance, log_sum
 from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray
-from failuretwin.digital_model.arm_classes import NOT_CALIBRATED
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
 from failuretwin.digital_model.settling import Settling, loads_in_range, poses_in_range
@@ -209,7 +208,7 @@ class HealthyModel:
     def is_calibrated(self) -> bool:
         """Whether this very robot was calibrated, or its geometry fitted."""
         fitted = self.twin.robot.profile.geometry.sensor_noise_m > 0.0
-        return fitted or not self.imperfections.name.endswith(NOT_CALIBRATED)
+        return fitted or not self.imperfections.of_class
 
     @property
     def _known_noise(self) -> float:
