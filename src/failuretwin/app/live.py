@@ -33,7 +33,6 @@ from failuretwin.core.foreign import printable
 from failuretwin.decision.streaming.alarm_rule import movements_to_tell
 from failuretwin.decision.streaming.monitor import FaultMonitor
 from failuretwin.decision.test_motions.probing import Prober
-from failuretwin.digital_model.arm_classes import GENERIC_NAME
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.inference.calibration_fit import MISFIT
 from failuretwin.inference.explanation import percent
@@ -126,7 +125,7 @@ def basis_line(known: CalibratedRobot, calibration: Path | None, budget: float, 
     Reported `goals` show lost commands at once.
     """
     healthy = known.imperfections
-    if healthy.name == GENERIC_NAME:
+    if healthy.of_class:
         line = (
             f"healthy behaviour: {healthy.name}; {healthy.source}. This robot is not calibrated: "
             "its behaviour is learned as it works, and until then faults take longer to show. "

@@ -33,7 +33,7 @@ import numpy as np
 from failuretwin.connection.calibration.result import SETTLING_UNITS, Calibration, Parameter
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.digital_model.arm_classes import GENERIC_NAME, class_of, generic_imperfections
+from failuretwin.digital_model.arm_classes import class_of, generic_imperfections
 from failuretwin.digital_model.calibrated_robot import (
     CalibratedRobot,
     RobotLike,
@@ -201,7 +201,7 @@ def _check(
     """Raise an error unless these are the figures of one robot of the kind, and new ones."""
     known = one.imperfections
     told = known.name if isinstance(given, Imperfections) else str(given)
-    if known.settling is None or known.name == GENERIC_NAME:
+    if known.settling is None or known.of_class:
         raise InputError(
             f"{told}: says nothing of where one robot settles. Expected its calibration, as "
             "`failuretwin calibrate` writes it."
@@ -278,7 +278,7 @@ def _of(one: Imperfections, name: str) -> tuple[FloatArray, FloatArray]:
     value = np.array(getattr(settling, name) or (0.0,) * motors)
     stated = np.array(getattr(doubt, name) or (0.0,) * motors)
     if name == "scatter":
-        if one.name == GENERIC_NAME:
+        if one.of_class:
             stated = np.full(motors, SCATTER_SPREAD)
         return np.log(value), stated
     return value, np.abs(value) * stated if name == "compliance" else stated

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
+from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.inference.explanation import percent
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.seen_runs import SeenRuns
@@ -35,7 +35,7 @@ def fits_this_robot(seen: SeenRuns) -> float | None:
         None where none was given, or nothing can be said.
     """
     known = seen.model.imperfections
-    if known.name == GENERIC_NAME or known.settling is None or not seen.sample.usable.any():
+    if known.of_class or known.settling is None or not seen.sample.usable.any():
         return None
     kind = HealthyModel.of(seen.model.twin, generic_imperfections(seen.model.twin.robot))
     says = []

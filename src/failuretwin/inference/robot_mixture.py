@@ -22,7 +22,7 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
+from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import with_rates
 from failuretwin.inference.engine.registration import robot_evidence, run_posterior
 from failuretwin.inference.engine.runs import has_rows
@@ -66,7 +66,7 @@ def robot_components(model: HealthyModel, priors: Priors) -> list[RobotComponent
     another, known = priors.setup.another_rate, model.imperfections
     if another == 0.0 or known.settling is None or not model.sensors.tool_alone:
         return [RobotComponent("", 0.0, model)]
-    if known.name == GENERIC_NAME:
+    if known.of_class:
         return _population(model, "", 1.0)
     name = f"these runs do not seem to be of the robot of calibration {known.name!r}"
     usual = generic_imperfections(model.twin.robot)

@@ -25,7 +25,7 @@ from failuretwin.inference.engine.redrawn_rows import redrawn_rows
 from failuretwin.inference.engine.registration import robot_posterior
 from failuretwin.inference.engine.rows import Scene
 from failuretwin.inference.engine.runs import RunsEvidence, has_rows
-from failuretwin.inference.engine.theta import columns, layout_of, robot_components
+from failuretwin.inference.engine.theta import AS_TOLD, columns, layout_of, robot_components
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -36,7 +36,7 @@ from failuretwin.inference.together.habits import Habits
 DRAWS = 20_000
 
 
-def evidence_of(runs, model, hypotheses, factors=False):
+def evidence_of(runs, model, hypotheses, factors=AS_TOLD):
     """The runs as the engine sees them, by their settled positions."""
     seen = Evidence(runs, model.settings, model.sensors).sound
     moments, sharp = moments_of(model, seen.settled), model.without_doubt
@@ -221,7 +221,7 @@ def test_errors_far_below_the_largest_have_nodes(misbuilt):
     model = HealthyModel(ft.DigitalTwin(robot), exact)
     seen = Evidence(made, model.settings, model.sensors).sound
     layout = layout_of(model)
-    V = robot_components(model, layout, False).covariance[0]
+    V = robot_components(model, layout, AS_TOLD).covariance[0]
     scene = Scene.of(model, moments_of(model, seen.settled), ft.Priors(), layout, V)
     mode = MODES["steady_state_error"]
     low, high = ft.Priors().sizes_of(mode, model, 0).ends

@@ -23,7 +23,7 @@ from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, largest_load
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.engine.theta import Layout, robot_components
+from failuretwin.inference.engine.theta import AS_TOLD, Layout, robot_components
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -220,7 +220,7 @@ def fit_settling(observations: Observations) -> SettlingFit:
     likelihood = RunLikelihood(evidence, model)
     layout = Layout(len(model.scatter), geometry=False)
     priors = Priors(setup=SetupPrior.known())
-    believed = robot_components(model, layout, factors=False)
+    believed = robot_components(model, layout, AS_TOLD)
     unit = np.sqrt(np.diag(believed.usual))
     base = Belief.of(believed, unit)
     together = RunsTogether.of(likelihood, [HEALTHY], priors, layout, base, unit)

@@ -22,7 +22,7 @@ from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.decision.streaming.learning import LifeLearner
 from failuretwin.decision.streaming.set_up_watch import PROOF, SetUpWatch
 from failuretwin.decision.streaming.trouble import DEAD, rests_throughout
-from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
+from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.faults.priors import Priors
@@ -104,7 +104,7 @@ class FaultMonitor(RobotStream):
     ) -> None:
         super().__init__(StreamingFleet(diagnoser, 1))
         known = diagnoser.healthy_model
-        ideal, cold = known.imperfections.settling is None, known.imperfections.name == GENERIC_NAME
+        ideal, cold = known.imperfections.settling is None, known.imperfections.of_class
         learns = known.sensors.tool_alone and not ideal
         self._learner = LifeLearner(diagnoser, resumed) if learns else None
         self._models: list[HealthyModel] = [] if cold and learns else [known]

@@ -18,12 +18,15 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.digital_model.arm_classes import GENERIC_NAME
 from failuretwin.inference.engine.posterior import misfit_of, theta_factors
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.engine.theta import (
+    AS_TOLD,
+    OF_CLASS,
+    SINCE_CALIBRATED,
     Components,
     Layout,
+    ScaleFactors,
     layout_of,
     robot_components,
 )
@@ -73,8 +76,14 @@ def displaced_weighing(
 def _usual(likelihood: RunLikelihood) -> tuple[Layout, Components]:
     model = likelihood.model
     layout = layout_of(model.without_doubt, bool(likelihood.evidence.on_the_way.any()))
-    factors = model.imperfections.name == GENERIC_NAME and model.scatter_factor == 1.0
-    return layout, robot_components(model, layout, factors)
+    return layout, robot_components(model, layout, _factors(model))
+
+
+def _factors(model: HealthyModel) -> ScaleFactors:
+    """Return what is unknown of scatter and noise; nothing of a robot said to be ideal."""
+    if model.scatter_factor != 1.0 or model.imperfections.settling is None:
+        return AS_TOLD
+    return OF_CLASS if model.imperfections.of_class else SINCE_CALIBRATED
 
 
 def displaced_components(

@@ -12,7 +12,7 @@ Section: docs/inference.md#theta
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -251,13 +251,31 @@ def layout_of(model: HealthyModel, moving: bool = False) -> Layout:
     return Layout(len(model.scatter), has_geometry(model), moving)
 
 
-SCATTER = {0.5: 0.25, 1.0: 0.4, 2.0: 0.2, 4.0: 0.1, 9.0: 0.05}
-"""Factors on the scatter of the class, and the share of robots of each; assumed, heavy above 1."""
-NOISE = {0.1: 0.2, 0.3: 0.15, 1.0: 0.5, 3.0: 0.1, 8.0: 0.05}
-"""Factors on the noise of a sensor that nobody has measured, and their shares; assumed."""
+@dataclass(frozen=True)
+class ScaleFactors:
+    """Factors on scatter and noise, and the share of robots of each.
+
+    Attributes:
+        scatter: On the scatter of the motors.
+        noise: On the noise of the sensor.
+    """
+
+    scatter: Mapping[float, float]
+    noise: Mapping[float, float]
 
 
-def robot_components(model: HealthyModel, layout: Layout, factors: bool) -> Components:
+AS_TOLD = ScaleFactors({1.0: 1.0}, {1.0: 1.0})
+"""Scatter and noise are known."""
+OF_CLASS = ScaleFactors(
+    {0.5: 0.25, 1.0: 0.4, 2.0: 0.2, 4.0: 0.1, 9.0: 0.05},
+    {0.1: 0.2, 0.3: 0.15, 1.0: 0.5, 3.0: 0.1, 8.0: 0.05},
+)
+"""Of robots that nobody has calibrated; assumed, heavy above 1."""
+SINCE_CALIBRATED = ScaleFactors({1.0: 0.72, 1.6: 0.14, 2.5: 0.1, 4.0: 0.04}, {1.0: 1.0})
+"""Of calibrated robots, which wear, work at other speeds or stand elsewhere since; assumed."""
+
+
+def robot_components(model: HealthyModel, layout: Layout, factors: ScaleFactors) -> Components:
     """Return what is believed of a robot whose sensor is where the profile says.
 
     The first is the usual robot of the class. One whose offsets are odd scatters as usual.
@@ -265,19 +283,18 @@ def robot_components(model: HealthyModel, layout: Layout, factors: bool) -> Comp
     Args:
         model: The healthy robot.
         layout: Places in theta.
-        factors: Whether its scatter and the noise of its sensor are unknown.
+        factors: What is unknown of its scatter and of the noise of its sensor.
     """
     doubted = bool(np.any(offset_deviation(model)))
     factors_of = (1.0, ODD_FACTOR) if doubted else (1.0,)
-    scatter, noise = (SCATTER, NOISE) if factors else ({1.0: 1.0}, {1.0: 1.0})
     rate = ODD_RATE if doubted else 0.0
     found = [
         (a * b * (1.0 - rate), 0, sigma, kappa)
-        for sigma, a in scatter.items()
-        for kappa, b in noise.items()
+        for sigma, a in factors.scatter.items()
+        for kappa, b in factors.noise.items()
     ]
     if doubted:
-        found += [(b * rate, 1, 1.0, kappa) for kappa, b in noise.items()]
+        found += [(b * rate, 1, 1.0, kappa) for kappa, b in factors.noise.items()]
     found.sort(key=lambda one: -one[0])
     weight, normal, sigma, kappa = zip(*found, strict=True)
     covariance = np.stack([_covariance(model, layout, factor) for factor in factors_of])

@@ -22,7 +22,6 @@ import numpy as np
 from failuretwin.core.movements import Movements
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
-from failuretwin.digital_model.arm_classes import GENERIC_NAME
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
@@ -161,7 +160,7 @@ def clock_posterior(seen: Evidence, model: HealthyModel) -> ClockPosterior:
         return ClockPosterior(0.0, float(1.0 - share[nothing]))
     fine = coarse[best] + np.arange(-STEP_S, STEP_S + FINE_S / 2, FINE_S)
     late = float(fine[np.argmax(_together(ways, fine, lag, unmoved).sum(axis=0))])
-    if model.imperfections.name == GENERIC_NAME and 0.0 < late <= UNKNOWN_LAG_S - lag:
+    if model.imperfections.of_class and 0.0 < late <= UNKNOWN_LAG_S - lag:
         return ClockPosterior()
     return ClockPosterior(late, float(1.0 - share[nothing]))
 

@@ -19,7 +19,12 @@ from failuretwin.inference.engine.registration import (
     registered_together,
     sensor_in_doubt,
 )
-from failuretwin.inference.engine.theta import layout_of, offsets_doubted, robot_components
+from failuretwin.inference.engine.theta import (
+    AS_TOLD,
+    layout_of,
+    offsets_doubted,
+    robot_components,
+)
 from failuretwin.inference.engine.weighing import odd_zeros_of
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -141,7 +146,7 @@ def begun(
     """
     model = likelihood.model
     layout = layout_of(model.without_doubt)
-    believed = robot_components(model, layout, factors=False)
+    believed = robot_components(model, layout, AS_TOLD)
     usual = unit = np.sqrt(np.diag(believed.usual))
     in_doubt = doubted(likelihood, hypotheses, priors)
     if in_doubt:

@@ -19,8 +19,8 @@ SCATTER_SPREAD = 0.3
 TAIL_SPREAD = 0.6
 """The same of its degrees of freedom; assumed, a factor of two, as loss rates."""
 NOISE_SPREAD, KNOWN_NOISE_SPREAD = 1.2, 0.01
-"""The same of the noise of a sensor that nobody has measured, as `engine.theta.NOISE` has it, and
-of one that somebody has."""
+"""The same of the noise of a sensor that nobody has measured, as `engine.theta.OF_CLASS` has it,
+and of one that somebody has."""
 HEAVIEST, LIGHTEST = 1.0, 50.0
 """Degrees of freedom that scatter may have; from 50 on it counts as normal."""
 UNSETTLED = 0.5

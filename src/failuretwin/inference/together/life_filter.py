@@ -28,6 +28,7 @@ from failuretwin.inference.engine.registration import (
     sensor_in_doubt,
 )
 from failuretwin.inference.engine.theta import (
+    AS_TOLD,
     Layout,
     layout_of,
     offsets_doubted,
@@ -132,7 +133,7 @@ class LifeFilter:
             limits: How fast and how far it may change.
         """
         layout = layout_of(model.without_doubt)
-        believed = robot_components(model, layout, factors=False)
+        believed = robot_components(model, layout, AS_TOLD)
         unit = np.sqrt(np.diag(believed.usual))
         learns = offsets_doubted(model) and model.imperfections.settling is not None
         habits = Habits.believed(model) if learns else None
@@ -375,7 +376,7 @@ class LifeFilter:
 
     def _look_for_sensor(self, window: RunsTogether) -> None:
         """Let the frame of the sensor be anywhere near, and judge the latest runs anew."""
-        usual = robot_components(self.model, self.layout, factors=False)
+        usual = robot_components(self.model, self.layout, AS_TOLD)
         asked = self.model, self.priors.setup, self.layout, usual
         variance = (displaced_components(*asked).widest / self.unit) ** 2
         variance[REGISTRATION:] = 0.0
