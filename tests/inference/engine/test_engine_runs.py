@@ -25,7 +25,13 @@ from failuretwin.inference.engine.redrawn_rows import redrawn_rows
 from failuretwin.inference.engine.registration import robot_posterior
 from failuretwin.inference.engine.rows import Scene
 from failuretwin.inference.engine.runs import RunsEvidence, has_rows
-from failuretwin.inference.engine.theta import AS_TOLD, columns, layout_of, robot_components
+from failuretwin.inference.engine.theta import (
+    AS_TOLD,
+    SINCE_CALIBRATED,
+    columns,
+    layout_of,
+    robot_components,
+)
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -164,6 +170,24 @@ def misbuilt():
     usual = generic_imperfections(robot)
     plan = Plan(built, ["healthy"], runs_per_class=12, seed=4, imperfections=usual)
     return robot, simulate(plan), built
+
+
+@pytest.mark.parametrize(("factor", "share"), [(1.0, (0.05, 0.3)), (3.0, (0.8, 1.0))])
+def test_a_calibrated_robot_may_scatter_more_than_when_it_was_calibrated(factor, share):
+    """At its old scatter the prior of 28 % for more falls; at three times it nearly vanishes."""
+    robot = load_robot("armpi_fpv")
+    known = load_calibration("armpi_fpv").imperfections
+    more = tuple(factor * scatter for scatter in known.settling.scatter)
+    made = replace(known, settling=replace(known.settling, scatter=more))
+    runs = simulate(Plan(robot, ["healthy"], 12, seed=3, imperfections=made))
+    model, healthy = HealthyModel(ft.DigitalTwin(robot), known), [Hypothesis()]
+    told, wide = (evidence_of(runs, model, healthy, one) for one in (AS_TOLD, SINCE_CALIBRATED))
+    by_component = logsumexp(wide.log_evidence, axis=2)
+    odds = np.exp(by_component - logsumexp(by_component, axis=1, keepdims=True))
+    more_probable = odds[:, wide.components.sigma > 1.0].sum(axis=1)
+    assert share[0] < more_probable.mean() < share[1]
+    gain = (wide.by_hypothesis - told.by_hypothesis).sum()
+    assert (gain > 0.0) == (factor > 1.0)
 
 
 def test_geometry_is_no_fault(misbuilt):

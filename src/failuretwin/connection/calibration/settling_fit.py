@@ -221,7 +221,7 @@ def fit_settling(observations: Observations) -> SettlingFit:
     layout = Layout(len(model.scatter), geometry=False)
     priors = Priors(setup=SetupPrior.known())
     believed = robot_components(model, layout, AS_TOLD)
-    unit = np.sqrt(np.diag(believed.usual))
+    unit = believed.usual_deviation
     base = Belief.of(believed, unit)
     together = RunsTogether.of(likelihood, [HEALTHY], priors, layout, base, unit)
     return fitted_to(observations, together)

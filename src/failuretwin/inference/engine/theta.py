@@ -146,6 +146,11 @@ class Components:
         return self.covariance.reshape(-1, *self.covariance.shape[-2:])[0]
 
     @property
+    def usual_deviation(self) -> FloatArray:
+        """Deviation of each part of theta in that distribution, (theta,)."""
+        return np.asarray(np.sqrt(np.diag(self.usual)))
+
+    @property
     def widest(self) -> FloatArray:
         """Largest deviation of each part of theta, (theta,)."""
         variance = np.diagonal(self.covariance, axis1=-2, axis2=-1)

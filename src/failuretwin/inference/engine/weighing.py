@@ -231,9 +231,10 @@ class Weighing:
             )
         if share[wide].sum() > TOLD:
             factor = components.sigma[int(np.argmax(np.where(wide, share, 0.0)))]
+            known = self.likelihood.model.imperfections
+            usual = "arms of this class do" if known.of_class else "when they were calibrated"
             said.append(
-                f"the motors seem to scatter about {factor:g} times as much as arms of this "
-                "class do; judged so"
+                f"the motors seem to scatter about {factor:g} times as much as {usual}; judged so"
             )
         if share[noisy].sum() > TOLD:
             noise = 1e3 * components.noise_m[int(np.argmax(np.where(noisy, share, 0.0)))]
@@ -253,7 +254,7 @@ class Weighing:
     @property
     def odd_zeros(self) -> list[str]:
         """Which zero of each run is far off what such robots do; empty where none is."""
-        usual = np.sqrt(np.diag(self.components.usual))
+        usual = self.components.usual_deviation
         return odd_zeros_of(self, usual, np.zeros(self.layout.size))
 
 

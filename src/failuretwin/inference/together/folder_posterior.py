@@ -147,7 +147,7 @@ def begun(
     model = likelihood.model
     layout = layout_of(model.without_doubt)
     believed = robot_components(model, layout, AS_TOLD)
-    usual = unit = np.sqrt(np.diag(believed.usual))
+    usual = unit = believed.usual_deviation
     in_doubt = doubted(likelihood, hypotheses, priors)
     if in_doubt:
         unit = displaced_components(model, priors.setup, layout, believed).widest

@@ -134,7 +134,7 @@ class LifeFilter:
         """
         layout = layout_of(model.without_doubt)
         believed = robot_components(model, layout, AS_TOLD)
-        unit = np.sqrt(np.diag(believed.usual))
+        unit = believed.usual_deviation
         learns = offsets_doubted(model) and model.imperfections.settling is not None
         habits = Habits.believed(model) if learns else None
         base = Belief.of(believed, unit)
