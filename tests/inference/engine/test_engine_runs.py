@@ -241,7 +241,7 @@ def test_errors_far_below_the_largest_have_nodes(misbuilt):
     robot, made, _ = misbuilt
     known = generic_imperfections(robot)
     own = Readings(10.0, noise_m=1e-5)
-    exact = replace(known, name="of this robot", readings=own, variation=None)
+    exact = replace(known, of_class=False, readings=own, variation=None)
     model = HealthyModel(ft.DigitalTwin(robot), exact)
     seen = Evidence(made, model.settings, model.sensors).sound
     layout = layout_of(model)

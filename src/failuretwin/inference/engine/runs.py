@@ -171,30 +171,34 @@ class RunsEvidence:
         kept = [self._narrow(h, one) for h, one in enumerate(first)]
         wanted = self._wanted(first)
         widest = self._widest(wanted)
-        runs = np.arange(len(wanted))
-        begun = self.weigh([_by_components(kept[h], runs, widest) for h in every])
-        others = wanted.copy()
-        others[runs, widest] = False
-        near = self._near(begun)
-        more = [np.nonzero(others & near[:, h, None]) for h in every]
+        begun = self.weigh([_by_components(kept[h], *np.nonzero(widest)) for h in every])
+        near, others = self._near(begun), wanted & ~widest
+        more = [np.nonzero(others & near[:, self.components.normal, h]) for h in every]
         says = self.weigh([_by_components(kept[h], *more[h]) for h in every])
         return self._refined([Weighed.joined(pair) for pair in zip(begun, says, strict=True)])
 
-    def _widest(self, wanted: BoolArray) -> IntArray:
-        """Return the component with the largest scatter that weighs each run, (run,)."""
-        order = np.lexsort((self.components.noise_m, self.components.sigma))
-        rank = np.argsort(order)
-        return np.asarray(np.argmax(np.where(wanted, rank, -1), axis=1))
+    def _widest(self, wanted: BoolArray) -> BoolArray:
+        """Return the components with the largest scatter of those that weigh a run.
+
+        One of each normal distribution of theta, (run, component).
+        """
+        components = self.components
+        rank = np.argsort(np.lexsort((components.noise_m, components.sigma)))
+        height = np.where(wanted, rank, -1)
+        of = components.normal[:, None] == components.normal
+        return np.asarray(wanted & (height >= np.where(of, height[:, None], -1).max(axis=2)))
 
     def _near(self, found: Sequence[Weighed]) -> BoolArray:
-        """Return the hypotheses that may come near the best of each run, (run, hypothesis).
+        """Return the hypotheses that may come near the best, (run, normal, hypothesis).
 
-        The component with the largest scatter tells them least apart.
+        Of all components with one belief about theta, that with the largest scatter tells them
+        least apart.
         """
-        table = np.full((self.scene.moments.runs, len(found)), -np.inf)
+        table = np.full((self.scene.moments.runs, self.components.normals, len(found)), -np.inf)
         for h, one in enumerate(found):
-            np.maximum.at(table[:, h], one.picks.run, one.log_evidence + self.log_odds[h])
-        return np.asarray(table > table.max(axis=1, keepdims=True) - HYPOTHESIS_NATS)
+            at = one.picks.run, self.components.normal[one.picks.component]
+            np.maximum.at(table[..., h], at, one.log_evidence + self.log_odds[h])
+        return np.asarray(table > table.max(axis=2, keepdims=True) - HYPOTHESIS_NATS)
 
     def _refined(self, found: Sequence[Weighed]) -> list[Weighed]:
         """Return what rows say, those that come near the best of their run refined."""
