@@ -12,7 +12,12 @@ import sqlalchemy as sa
 from failuretwin.core.errors import check_name
 from failuretwin.data_knowledge.records import CHECK_DAYS
 from failuretwin.data_knowledge.records.episodes import CONFIRMED
-from failuretwin.data_knowledge.records.history import OTHER_CAUSE, WRONG
+from failuretwin.data_knowledge.records.history import (
+    OTHER_CAUSE,
+    WRONG,
+    StoredCalibration,
+    stored_calibration,
+)
 from failuretwin.data_knowledge.records.schema import (
     calibrations,
     diagnoses,
@@ -21,6 +26,10 @@ from failuretwin.data_knowledge.records.schema import (
     findings,
     profiles,
     robots,
+)
+from failuretwin.data_knowledge.records.unknown_faults import (
+    read_episodes_of_unknown,
+    unknown_groups,
 )
 
 DAY_S = 86_400.0
@@ -154,6 +163,18 @@ def fleet_faults(connection: sa.Connection, kind: str) -> FleetFaults:
     return FleetFaults(kind, robot_count, 24.0 * days, confirmed)
 
 
+def fleet_calibrations(connection: sa.Connection, kind: str) -> dict[str, StoredCalibration]:
+    """Return the calibrations in force of the robots of a kind, each file once, by robot."""
+    query = (
+        sa.select(kinds.c.robot, calibrations)
+        .join(kinds, kinds.c.robot_id == calibrations.c.robot_id)
+        .where(kinds.c.kind == kind, calibrations.c.valid_to.is_(None))
+        .order_by(calibrations.c.id.desc())
+    )
+    of_file = {one.sha256: (one.robot, one) for one in connection.execute(query)}
+    return {robot: stored_calibration(one) for robot, one in list(of_file.values())[::-1]}
+
+
 def watched_days(connection: sa.Connection) -> dict[str, tuple[int, float]]:
     """Return the number of robots of each kind, and the time they were watched in all [days]."""
     query = sa.select(kinds.c.kind, FIRST_RUN, LAST_RUN)
@@ -200,6 +221,11 @@ def _due(connection: sa.Connection, now: datetime, days: float) -> list[tuple[An
     return found
 
 
+def _unknown(connection: sa.Connection, now: datetime, days: float) -> list[tuple[Any, ...]]:
+    names = {row: kind for row, _, kind in connection.execute(sa.select(kinds))}
+    return [group.row for group in unknown_groups(read_episodes_of_unknown(connection), names)]
+
+
 @dataclass(frozen=True)
 class _Question:
     title: str
@@ -222,6 +248,14 @@ QUESTIONS = {
         "Which diagnoses were wrong?",
         ("robot", "episode", "since", "diagnosis", "finding", "cause", "person"),
         _wrong,
+    ),
+    "unknown-faults": _Question(
+        "Which faults does no known mode explain? Each group may be a mode of its own",
+        (
+            *("kind", "motor", "episodes", "runs", "robots", "size", "sign", "law"),
+            *("since", "until", "alike"),
+        ),
+        _unknown,
     ),
     "due": _Question("Which robots are due for a check?", ("robot", "last_run", "why"), _due),
 }
