@@ -39,7 +39,7 @@ from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections, vary
 from failuretwin.failure_behavior.fault import FaultGroup
 from failuretwin.failure_behavior.mode import Range, SizedMode
-from failuretwin.failure_behavior.registry import register_mode
+from failuretwin.failure_behavior.registry import MODES, register_mode
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.posterior import unlisted
 
@@ -64,6 +64,13 @@ class OneSided(SizedMode):
         return reference - faults.effect(time) * (reference > SIDE_RAD)
 
 
+OWN: dict[str, SizedMode] = {
+    "end_stop": EndStop(onset_s=(0.0, 0.0), profiles=("step",)),
+    "one_sided": OneSided(onset_s=(0.0, 0.0), profiles=("step",)),
+}
+"""Modes that nobody has named."""
+
+
 def main() -> None:
     """Simulate robots, diagnose and store their runs, and ask for groups."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -73,8 +80,8 @@ def main() -> None:
     parser.add_argument("--mover", type=int, default=3, help="motor with the unnamed faults")
     parser.add_argument("--keep", help="store to make, or to ask again")
     options = parser.parse_args()
-    for mode in (EndStop(onset_s=(0.0, 0.0)), OneSided(onset_s=(0.0, 0.0))):
-        register_mode(replace(mode, profiles=("step",)))
+    for mode in OWN.values():
+        register_mode(mode)
     motor = f"motor_{options.mover}"
     states = [f"{motor}:end_stop", f"{motor}:one_sided", "healthy", "motor_2:stuck"]
     states.append(f"{motor}:steady_state_error")
@@ -100,7 +107,11 @@ def live(store: ft.Store, state: str, number: int, count: int, seed: int) -> Non
     assert spread is not None
     narrow = replace(spread, bias=(0.002,) * 4, compliance=(0.1,) * 4, friction=(0.002,) * 4)
     own: Imperfections = vary(replace(known, variation=narrow), rng)
-    plan = ft.Plan(robot, [state], count, int(rng.integers(1 << 30)), own)
+    mode, modes = OWN.get(state.partition(":")[2]), dict(MODES)
+    if mode is not None:  # the fault of a robot keeps its size
+        size = float(rng.uniform(*mode.magnitude))
+        modes[mode.mode] = replace(mode, magnitude=(size, size))
+    plan = ft.Plan(robot, [state], count, int(rng.integers(1 << 30)), own, modes=modes)
     hypotheses = [*paper_hypotheses(robot.motor_names), UNKNOWN]
     diagnoser = ft.BayesDiagnoser(robot, known, hypotheses)
     with patch("failuretwin.inference.posterior.unlisted", forgetting):
@@ -115,8 +126,7 @@ def live(store: ft.Store, state: str, number: int, count: int, seed: int) -> Non
 
 def forgetting(likelihood: RunLikelihood, known: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return the single faults that are not offered, but for those that nobody has named."""
-    own = {"end_stop", "one_sided"}
-    return [h for h in unlisted(likelihood, known) if h.faults[0].mode not in own]
+    return [h for h in unlisted(likelihood, known) if h.faults[0].mode not in OWN]
 
 
 def tell(url: str) -> None:

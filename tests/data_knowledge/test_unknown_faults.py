@@ -79,7 +79,8 @@ def test_the_evidence_of_each_law_is_that_of_its_normal_density(rng):
     noise = np.diag(np.repeat([(0.01 / e.size) ** 2 + MISFIT**2 for e in (one, other)], 20))
     by_angle = [[np.exp(-0.5 * ((a - b) / (LENGTH * 2.0)) ** 2) for b in angle] for a in angle]
     laws = [np.ones((40, 40)), by_angle, way[:, None] == way, np.eye(40)]
-    wanted = [multivariate_normal.logpdf(x, cov=np.asarray(law) + noise) for law in laws]
+    prior = np.log([0.3, 0.3, 0.3, 0.1])
+    wanted = prior + [multivariate_normal.logpdf(x, cov=np.asarray(law) + noise) for law in laws]
     np.testing.assert_allclose(log_evidence([one, other], 2.0), wanted, rtol=1e-9)
 
 

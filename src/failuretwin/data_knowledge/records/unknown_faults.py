@@ -1,12 +1,13 @@
 """Faults that no known mode explains: episodes of `unknown`, grouped by how the motor is displaced.
 
 Displacements d of a motor follow one of four laws K, a Gaussian process in its angle phi and the
-direction of its last travel, scaled to an rms of 1. Two episodes have the same law with
+direction of its last travel, in units of its size. Two episodes have the same law with
 
     p(same | d_1, d_2) = B / (1 + B)
-    B = sum over K of p(d_1, d_2 | K) / [4 * mean of p(d_1 | K) * mean of p(d_2 | K)]
+    B = p(d_1, d_2) / [p(d_1) p(d_2)],    p(d) = sum over K of w_K p(d | K)
 
-at even prior odds, and the groups are those of average linkage at p = 1/2.
+at even prior odds, with the prior w of the laws. The groups are those of average linkage at
+p = 1/2.
 
 Section: docs/store.md#unknown-faults
 """
@@ -40,12 +41,17 @@ MOST_EPISODES = 60
 """Episodes of a motor that are compared, the newest."""
 LENGTH = 0.15
 """Length over which the law by angle varies, as a share of the angles that were seen; assumed."""
-MISFIT = 0.2
-"""Part of a displacement that a law leaves open, as a share of the rms; assumed."""
+MISFIT = 0.3
+"""Part of a displacement that a law leaves open, as a share of the size; assumed."""
+SHOWN_DEVIATIONS = 3.0
+"""Deviations from which a displacement shows."""
+OUTLIER_SIZES = 3.0
+"""Sizes from which a displacement is none of the fault, such as that of a dropped command."""
 ONE_SIGN = 0.9
 """Share of the displacement of one sign from which a fault has this sign."""
-LAWS = ("constant", "by angle", "by direction", "each movement")
-"""Laws of the displacement; with the last, each movement draws its own."""
+LAWS = {"constant": 0.3, "by angle": 0.3, "by direction": 0.3, "each movement": 0.1}
+"""Laws of the displacement and their prior; with the last, each movement draws its own, so it makes
+all alike that fit no other."""
 LISTS = ("displacement", "deviation", "angle", "direction")
 """What is stored of each movement."""
 SHOWN = {"rad": (180.0 / math.pi, "deg"), "m": (1e3, "mm")}
@@ -132,8 +138,10 @@ class UnknownEpisode:
 
     @property
     def size(self) -> float:
-        """Root mean square of the displacements."""
-        return max(float(np.sqrt(np.mean(self.displacement**2))), 1e-12)
+        """Median of the displacements that show, by their amount; of all if none does."""
+        amount = np.abs(self.displacement)
+        shown = amount[amount > SHOWN_DEVIATIONS * self.deviation]
+        return max(float(np.median(shown if len(shown) else amount)), 1e-12)
 
 
 def _newest(rows: Sequence[Any], name: str) -> FloatArray:
@@ -153,7 +161,7 @@ def read_episodes_of_unknown(connection: sa.Connection) -> list[UnknownEpisode]:
 
 
 def log_evidence(episodes: Sequence[UnknownEpisode], span: float) -> FloatArray:
-    """Return log p(d | K) of the displacements of some episodes together, (law,).
+    """Return log w_K + log p(d | K) of the displacements of some episodes together, (law,).
 
     Args:
         episodes: They share the law.
@@ -168,9 +176,11 @@ def log_evidence(episodes: Sequence[UnknownEpisode], span: float) -> FloatArray:
     apart = (angle[:, None] - angle) / (LENGTH * max(span, 1e-12))
     alike: BoolArray = direction[:, None] == direction
     laws = (np.ones_like(apart), np.exp(-0.5 * apart**2), alike.astype(float), 0.0 * apart)
-    free = deviation**2 + MISFIT**2
+    outlier = np.where(np.abs(shift) > OUTLIER_SIZES, shift**2, 0.0)
+    free = deviation**2 + MISFIT**2 + outlier
     noise = [free, free, free, free + 1.0]
-    return np.array([_log_normal(shift, law, own) for law, own in zip(laws, noise, strict=True)])
+    found = [_log_normal(shift, law, own) for law, own in zip(laws, noise, strict=True)]
+    return np.array(found) + np.log(list(LAWS.values()))
 
 
 def _log_normal(values: FloatArray, shared: FloatArray, own: FloatArray) -> float:
@@ -184,10 +194,9 @@ def _log_normal(values: FloatArray, shared: FloatArray, own: FloatArray) -> floa
 def likeness(episodes: Sequence[UnknownEpisode]) -> FloatArray:
     """Return the probability that two episodes have the same law, (pair,) as `combinations`."""
     span = _span(episodes)
-    alone = [logsumexp(log_evidence([one], span)) - math.log(len(LAWS)) for one in episodes]
+    alone = [logsumexp(log_evidence([one], span)) for one in episodes]
     log_factor = [
-        logsumexp(log_evidence([episodes[i], episodes[j]], span))
-        - (math.log(len(LAWS)) + alone[i] + alone[j])
+        logsumexp(log_evidence([episodes[i], episodes[j]], span)) - alone[i] - alone[j]
         for i, j in combinations(range(len(episodes)), 2)
     ]
     return np.asarray(expit(np.array(log_factor)))
@@ -217,7 +226,8 @@ class UnknownGroup:
     @property
     def law(self) -> str:
         """The most probable of `LAWS`."""
-        return LAWS[int(np.argmax(log_evidence(self.episodes, _span(self.episodes))))]
+        found = log_evidence(self.episodes, _span(self.episodes))
+        return list(LAWS)[int(np.argmax(found))]
 
     @property
     def sign(self) -> str:
