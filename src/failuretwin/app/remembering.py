@@ -121,11 +121,12 @@ class RobotRecord:
     def fault_factors(self, hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
         """Return how many times as probable faults are as by the table, and say why.
 
-        The confirmed faults of all robots of the kind in the store tell.
+        The confirmed faults of all robots of the kind in the store tell, by the age of each motor.
         """
         from failuretwin.connection.fault_rates import LearnedRates
 
-        learned = LearnedRates.of(self.store.fleet_faults(self.profile.name), hypotheses)
+        seen, ages = self.store.fleet_faults(self.profile.name), self.store.motor_ages(self.name)
+        learned = LearnedRates.of(seen, hypotheses, ages)
         tell(learned.line, err=True)
         return learned.factors
 
