@@ -1,7 +1,7 @@
 """What do learned rates of faults add to diagnoses, and what do wrong confirmations break?
 
     python benchmarks/learned_priors.py [--runs 1002] [--robots 10] [--days 20] [--fleets 3]
-                                        [--seed 0]
+                                        [--movements 5] [--seed 0]
 
 The true rate of each fault is that of the table times a log-normal factor (deviation 1). Robots of
 a fleet live with them; each fault is diagnosed, confirmed and repaired in a store. The states of
@@ -29,6 +29,7 @@ from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.records.log_files import LogFile
 from failuretwin.decision.scoring import log_score, log_score_gain
 from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.posterior import log_prior
 
 SPREAD = 1.0
@@ -44,6 +45,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=10)
     parser.add_argument("--days", type=float, default=20.0)
     parser.add_argument("--fleets", type=int, default=3)
+    parser.add_argument("--movements", type=int, default=5, help="of each run")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     rng, robot = np.random.default_rng(options.seed), ft.load_robot("armpi_fpv")
@@ -53,7 +55,8 @@ def main() -> None:
     for fleet in range(options.fleets):
         factors = {name: float(np.exp(SPREAD * rng.normal())) for name in table_rates(hypotheses)}
         clean, wrong = learned(factors, hypotheses, options.robots, options.days, rng)
-        found = runs_of(factors, hypotheses, options.runs // options.fleets, rng)
+        count = options.runs // options.fleets
+        found = runs_of(factors, hypotheses, count, options.movements, rng)
         plain = [one.posterior for one in found]
         by_clean, by_wrong, by_truth = (
             [reweighted(one, each) for one in plain]
@@ -115,6 +118,7 @@ def runs_of(
     factors: Mapping[str, float],
     hypotheses: Sequence[Hypothesis],
     count: int,
+    movements: int,
     rng: np.random.Generator,
 ) -> list[Diagnosis]:
     """Return diagnoses of runs whose states are drawn by true rates, by the stated priors."""
@@ -124,7 +128,8 @@ def runs_of(
     drawn = Counter(rng.choice(len(hypotheses), count, p=weight).tolist())
     diagnoser, found = ft.BayesDiagnoser(robot, known), list[Diagnosis]()
     for state, times in sorted(drawn.items()):
-        plan = ft.Plan(robot, [hypotheses[state]], times, int(rng.integers(1 << 30)), known)
+        seed, motion = int(rng.integers(1 << 30)), RandomMovements(count=movements)
+        plan = ft.Plan(robot, [hypotheses[state]], times, seed, known, motion)
         found += diagnoser.diagnose(ft.simulate(plan))
     return found
 
