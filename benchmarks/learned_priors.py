@@ -30,11 +30,14 @@ from failuretwin.data_knowledge.records.log_files import LogFile
 from failuretwin.decision.scoring import log_score, log_score_gain
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.inference.faults.priors import priors_of
 from failuretwin.inference.posterior import log_prior
 
 SPREAD = 1.0
 """Deviation of the logarithm of true rates about those of the table."""
 WRONG_SHARE = 0.05
+DRAWN_COUNTS = (10.0, 50.0)
+"""Range of the simulated steady-state errors [servo counts]."""
 START = datetime(2026, 1, 1, tzinfo=UTC)
 
 
@@ -126,7 +129,9 @@ def runs_of(
     known = load_calibration("armpi_fpv", robot).imperfections
     weight = np.exp(log_prior(hypotheses, ft.Priors(fault_factors=factors)))
     drawn = Counter(rng.choice(len(hypotheses), count, p=weight).tolist())
-    diagnoser, found = ft.BayesDiagnoser(robot, known), list[Diagnosis]()
+    # As drawn: with small errors in the prior too, healthy runs would be paid for them.
+    priors = priors_of(robot, DRAWN_COUNTS, None)
+    diagnoser, found = ft.BayesDiagnoser(robot, known, priors=priors), list[Diagnosis]()
     for state, times in sorted(drawn.items()):
         seed, motion = int(rng.integers(1 << 30)), RandomMovements(count=movements)
         plan = ft.Plan(robot, [hypotheses[state]], times, seed, known, motion)

@@ -249,7 +249,6 @@ def _fitted(known: Sequence[CalibratedRobot], robot: Robot) -> Population:
     imperfections = Imperfections(
         name=name,
         source=source,
-        protocol=max(one.protocol for one in each),
         settling=settling,
         timing=_timing([one.timing for one in profile]),
         lost_commands=_losses(each, usual),
