@@ -49,9 +49,9 @@ AT = ("--recorded", "2026-03-02T14:30")
 def test_a_store_is_made_once_and_checked(run, store, tmp_path):
     before = (tmp_path / "robots.db").read_bytes()
     assert run("store", "init", *store).startswith("the store: robots.db\n")
-    assert run("store", "upgrade", *store) == "robots.db: is up to date (revision 3)\n"
+    assert run("store", "upgrade", *store) == "robots.db: is up to date (revision 4)\n"
     assert (tmp_path / "robots.db").read_bytes() == before
-    assert run("store", "check", *store) == "robots.db: revision 3; empty\nno problems\n"
+    assert run("store", "check", *store) == "robots.db: revision 4; empty\nno problems\n"
 
 
 def test_diagnoses_are_remembered_with_their_log(run, store, rows, tmp_path):
@@ -147,7 +147,7 @@ def test_questions_and_exports(run, store, tmp_path):
     assert "motor_2  steady_state_error  1" in run("query", "failing-motors", *store)
     assert "open fault" in run("query", "due", "--days", 1, *store)
     run("store", "export", "--out", "tables", *store)
-    assert len(list((tmp_path / "tables").glob("*.parquet"))) == 15
+    assert len(list((tmp_path / "tables").glob("*.parquet"))) == 16
 
 
 @pytest.mark.parametrize(

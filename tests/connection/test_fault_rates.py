@@ -17,7 +17,7 @@ from failuretwin.connection.fault_rates import (
     table_rates,
 )
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
-from failuretwin.data_knowledge.records.queries import FleetFaults
+from failuretwin.data_knowledge.records.fleet import FleetFaults
 from failuretwin.inference.posterior import log_prior
 from failuretwin.inference.together.fault_filter import RATES
 

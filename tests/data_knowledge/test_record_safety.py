@@ -24,6 +24,7 @@ from hypothesis import strategies as st
 
 import failuretwin as ft
 from failuretwin.core.errors import InputError, OutputError
+from failuretwin.core.hypothesis import MotorResidual
 from failuretwin.data_knowledge.records import migrations
 from failuretwin.data_knowledge.records.beliefs import Belief, BeliefLine
 from failuretwin.data_knowledge.records.database import Database
@@ -156,7 +157,9 @@ def test_no_program_changes_or_deletes_evidence(full_place, data):
 def full_place(place, store, armpi):
     """A store with a row in every table."""
     kept = store.keep_calibration("arm_7", "x = 1", name="c", protocol="P0c", profile=armpi)
-    store.remember([diagnosis("run", "motor_1:stuck")], "arm_7", calibration=kept.number)
+    residual = MotorResidual("motor_1", "rad", (0.1,), (0.01,), (0.5,), (1.0,))
+    told = diagnosis("run", "motor_1:stuck", residual=residual)
+    store.remember([told], "arm_7", calibration=kept.number)
     store.found("arm_7", 1, "confirmed")
     store.repaired("arm_7", "motor_1")
     store.begin("arm_7", Basis("act"), Note(NOW, "target 1: reached"))

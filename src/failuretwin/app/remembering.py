@@ -62,11 +62,36 @@ class RobotRecord:
     @property
     def calibrated(self) -> CalibratedRobot | None:
         """The robot with its calibration of the store; None: it uses none."""
-        stored = self.calibration
-        if stored is None:
-            return None
-        where = f"{self.store.name}: calibration {stored.name!r}"
+        return None if self.calibration is None else self._with(self.calibration, self.name)
+
+    def _with(self, stored: StoredCalibration, robot: str) -> CalibratedRobot:
+        """Return the robot with a calibration of the store, which is that of `robot`."""
+        where = f"{self.store.name}: calibration {stored.name!r} of {robot}"
         return calibration_from_table(tomllib.loads(stored.document), self.profile, where)
+
+    @property
+    def population(self) -> CalibratedRobot | None:
+        """The robot as one of the calibrated robots of its kind, and say so.
+
+        None: it has a calibration of its own, also by a profile that is its own, or too few of its
+        kind have one.
+        """
+        from failuretwin.connection.population import LEAST_ROBOTS, Population
+
+        own_profile = self.name == self.profile.name and self.profile.imperfections_file is not None
+        if self.calibration is not None or own_profile:
+            return None
+        found, kind = self.store.fleet_calibrations(self.profile.name), self.profile.name
+        if len(found) < LEAST_ROBOTS:
+            count = counted(len(found), "calibrated robot")
+            need = f"expected {LEAST_ROBOTS} or more; the profile's figures are used"
+            tell(f"learned healthy behaviour: {count} ({kind}), {need}", err=True)
+            return None
+        known = [self._with(stored, robot) for robot, stored in found.items()]
+        figures = Population.fit(known, self.profile).imperfections
+        name = f"population of {len(known)} calibrated robots ({kind})"
+        tell(f"learned healthy behaviour: {name}", err=True)
+        return CalibratedRobot(self.profile, replace(figures, name=name))
 
     @property
     def calibration_number(self) -> int | None:
@@ -96,11 +121,12 @@ class RobotRecord:
     def fault_factors(self, hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
         """Return how many times as probable faults are as by the table, and say why.
 
-        The confirmed faults of all robots of the kind in the store tell.
+        The confirmed faults of all robots of the kind in the store tell, by the age of each motor.
         """
         from failuretwin.connection.fault_rates import LearnedRates
 
-        learned = LearnedRates.of(self.store.fleet_faults(self.profile.name), hypotheses)
+        seen, ages = self.store.fleet_faults(self.profile.name), self.store.motor_ages(self.name)
+        learned = LearnedRates.of(seen, hypotheses, ages)
         tell(learned.line, err=True)
         return learned.factors
 

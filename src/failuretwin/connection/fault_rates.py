@@ -4,7 +4,8 @@
     lambda | n ~ Gamma(w + n, w / lambda_0 + T)
 
 with the rate of the table lambda_0, n confirmed faults in a robot time of T, and the weight w of
-the table in faults.
+the table in faults. Where the age of a motor is known, the hazard is constant within bands of age:
+n and T are those of its band.
 
 Section: docs/store.md#learned-rates-of-faults
 """
@@ -25,7 +26,7 @@ from failuretwin.inference.posterior import prior_odds
 from failuretwin.inference.together.fault_filter import RATES
 
 if TYPE_CHECKING:
-    from failuretwin.data_knowledge.records.queries import FleetFaults
+    from failuretwin.data_knowledge.records.fleet import FleetFaults
 
 WEIGHT = 2.0
 """Faults that the table counts as; assumed. A single confirmation multiplies the odds of a fault by
@@ -91,10 +92,24 @@ class LearnedRates:
     rates: Sequence[FaultRate]
 
     @classmethod
-    def of(cls, seen: FleetFaults, hypotheses: Sequence[Hypothesis]) -> LearnedRates:
-        """Return the rates of the single faults among some hypotheses."""
-        table = table_rates(hypotheses)
-        rates = [FaultRate(k, v, seen.confirmed.get(k, 0), seen.hours) for k, v in table.items()]
+    def of(
+        cls,
+        seen: FleetFaults,
+        hypotheses: Sequence[Hypothesis],
+        ages: Mapping[str, float] | None = None,
+    ) -> LearnedRates:
+        """Return the rates of the single faults among some hypotheses.
+
+        Args:
+            seen: Confirmed faults of a kind of robot.
+            hypotheses: The hypotheses.
+            ages: Age of each motor [h]; of others all ages count.
+        """
+        rates = []
+        for name, per_h in table_rates(hypotheses).items():
+            motor = name.partition(":")[0]
+            hours, confirmed = seen.at_risk(motor, (ages or {}).get(motor))
+            rates.append(FaultRate(name, per_h, confirmed.get(name, 0), hours))
         return cls(seen, rates)
 
     @property

@@ -57,6 +57,8 @@ CLASS_ROBOTS = 3.0
 """Robots that the deviation of the class counts for; assumed."""
 RATE_SPREAD = 0.7
 """Deviation of the logarithm of loss rates within a class, a factor of two; assumed."""
+LEAST_ROBOTS = 2
+"""Robots from which there is a population."""
 ROUNDS = 50
 """Rounds of the deviation, each half the way in its logarithm; twenty are mostly enough."""
 TOLD = 0.7
@@ -147,7 +149,9 @@ class Population:
 
     @classmethod
     def fit(
-        cls, calibrations: Sequence[Imperfections | str | Path], robot: RobotLike = "armpi_fpv"
+        cls,
+        calibrations: Sequence[CalibratedRobot | Imperfections | str | Path],
+        robot: RobotLike = "armpi_fpv",
     ) -> Population:
         """Return the population that some robots come from.
 
@@ -158,8 +162,8 @@ class Population:
         timing of a robot with loops of its own does not count.
 
         Args:
-            calibrations: One of each robot, two at least: figures, or names or paths as for
-                `load_calibration`.
+            calibrations: One of each robot, `LEAST_ROBOTS` at least: the robot with it, figures, or
+                names or paths as for `load_calibration`.
             robot: What kind they are of.
 
         Raises:
@@ -167,13 +171,16 @@ class Population:
                 another kind.
         """
         model = calibrated(robot, "none").robot
-        if isinstance(calibrations, str | Path) or len(calibrations) < 2:
+        if isinstance(calibrations, str | Path) or len(calibrations) < LEAST_ROBOTS:
             count = 1 if isinstance(calibrations, str | Path) else len(calibrations)
             raise InputError(
                 f"a population of {count} calibrations: expected those of two robots or more. "
                 "Calibrate another robot of the kind."
             )
-        known = [calibrated(model, each) for each in calibrations]
+        known = [
+            each if isinstance(each, CalibratedRobot) else calibrated(model, each)
+            for each in calibrations
+        ]
         for index, each in enumerate(known):
             _check(each, calibrations[index], model, known[:index])
         return _fitted(known, model)
@@ -200,7 +207,7 @@ def _check(
 ) -> None:
     """Raise an error unless these are the figures of one robot of the kind, and new ones."""
     known = one.imperfections
-    told = known.name if isinstance(given, Imperfections) else str(given)
+    told = str(given) if isinstance(given, str | Path) else known.name
     if known.settling is None or known.of_class:
         raise InputError(
             f"{told}: says nothing of where one robot settles. Expected its calibration, as "

@@ -195,6 +195,33 @@ class MovementEvidence:
 
 
 @dataclass(frozen=True)
+class MotorResidual:
+    """Settled displacements of the one motor that explains a run best, movement by movement.
+
+    Attributes:
+        motor: The motor.
+        unit: Unit of displacements and angles: rad, or m of a slide.
+        displacement: Settled angle minus that of a healthy motor.
+        deviation: Standard deviation of each.
+        angle: Settled angle of a healthy motor.
+        direction: Sign of its last travel; 0: it stayed.
+    """
+
+    motor: str
+    unit: str
+    displacement: tuple[float, ...]
+    deviation: tuple[float, ...]
+    angle: tuple[float, ...]
+    direction: tuple[float, ...]
+
+    @classmethod
+    def from_fields(cls, fields: Mapping[str, Any]) -> MotorResidual:
+        """Return the residual whose `dataclasses.asdict` went through JSON."""
+        lists = {name: tuple(v) for name, v in fields.items() if name not in ("motor", "unit")}
+        return cls(fields["motor"], fields["unit"], **lists)
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """Diagnosis of one run. `None`: unknown or not applicable.
 
@@ -214,6 +241,7 @@ class Diagnosis:
         undecided: Why there is no verdict; empty where there is one.
         protocol: Real data used by the method: P0, P0c, P1 or P2.
         method: Diagnoser and healthy behaviour.
+        residual: Displacements of one motor, where ``unknown`` is most probable.
     """
 
     run: str
@@ -231,6 +259,7 @@ class Diagnosis:
     undecided: str = ""
     protocol: str = "P0"
     method: str = ""
+    residual: MotorResidual | None = None
 
     @property
     def ranked(self) -> list[str]:
@@ -270,7 +299,10 @@ class Diagnosis:
         }
         evidence = tuple(MovementEvidence(**movement) for movement in fields["evidence"])
         lines = {name: tuple(fields[name]) for name in ("explanation", "quality")}
-        return cls(**{**fields, **intervals, **lines, "evidence": evidence})
+        told = fields.get("residual")
+        residual = None if told is None else MotorResidual.from_fields(told)
+        made = {**fields, **intervals, **lines, "evidence": evidence, "residual": residual}
+        return cls(**made)
 
     def to_record(self) -> dict[str, Any]:
         """Return the JSON object of the contract."""

@@ -44,6 +44,7 @@ from failuretwin.inference.faults.marginal import (
     marginal_likelihood,
 )
 from failuretwin.inference.faults.missed_movements import missed_movements_likelihood
+from failuretwin.inference.faults.motor_residual import motor_residual
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.faults.stuck import stuck_model
 from failuretwin.inference.faults.unknown import unknown_likelihood
@@ -396,6 +397,8 @@ class Posterior:
             estimate = best.estimate(run)
             losses = self._losses(run, estimate, ranked[0])
             diagnosis = _with_estimate(diagnosis, ranked[0], estimate, place, robot)
+            if not ranked[0].known:
+                diagnosis = replace(diagnosis, residual=motor_residual(self.likelihood, run))
         return with_joint_names(worded(diagnosis, ranked, losses, class_name(robot)), robot)
 
     def _evidence(

@@ -146,7 +146,8 @@ def diagnose(
     from failuretwin.inference.observation.sensors import TOOL_ALONE, sensing_of
 
     offsets.check_correctable(reading.logs, correct)
-    together, (stored, known) = track or self_calibrate, memory.look_up(robot)
+    together = track or self_calibrate
+    stored, known = memory.look_up(robot, learned_priors and not together)
     keeper = None if stored is None else stored.keeper(reading, recorded)
     bayes = ft.BayesDiagnoser(
         known.twin,

@@ -111,7 +111,7 @@ def watch(
 
     if not probe.probes:
         opt.refuse_unused("nothing is moved without --probe N", *PROBING)
-    model, (stored, known) = robot.model, memory.look_up(robot)
+    model, (stored, known) = robot.model, memory.look_up(robot, learned_priors and not track)
     life = _life(memory.needed(stored, "--track")) if track else None
     resumed = (lambda start: start) if life is None else life.resumed
     priors = _learned_priors(memory.needed(stored, LEARNED)) if learned_priors else None

@@ -39,17 +39,21 @@ class StoreOptions:
     store: str | None
     robot_name: str | None
 
-    def look_up(self, robot: opt.RobotOptions) -> tuple[RobotRecord | None, CalibratedRobot]:
+    def look_up(
+        self, robot: opt.RobotOptions, learned: bool = False
+    ) -> tuple[RobotRecord | None, CalibratedRobot]:
         """Return the robot in the store, and as it is calibrated.
 
-        It has the calibration of `--calibration`, else the one in force in the store, else that of
-        its profile. Without `--store` there is no record.
+        It has the calibration of `--calibration`, else the one in force in the store, else, if
+        `learned`, the population of its kind there, else that of its profile. Without `--store`
+        there is no record.
         """
         record = self.record(robot)
-        if record is not None and robot.calibration is None:
-            record = record.with_calibration()
-        stored = None if record is None else record.calibrated
-        return record, stored or robot.known
+        if record is None or robot.calibration is not None:
+            return record, robot.known
+        record = record.with_calibration()
+        kind = record.population if learned else None
+        return record, record.calibrated or kind or robot.known
 
     def needed(self, stored: RobotRecord | None, option: str) -> RobotRecord:
         """Return the robot in the store, which an option needs.
@@ -88,7 +92,8 @@ LEARNED, LEARNED_METHOD = "--learned-priors", "learned priors"
 learned_priors_option = opt.flag_option(
     LEARNED,
     "With --store: faults that people confirmed at robots of this kind count more, others less, "
-    "than by the assumed rates.",
+    "than by the assumed rates. A robot without a calibration counts as one of the calibrated "
+    "robots of its kind.",
 )
 recorded_option = click.option(
     "--recorded",

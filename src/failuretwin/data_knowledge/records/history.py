@@ -344,10 +344,11 @@ def read_calibrations(connection: sa.Connection, row: int) -> tuple[StoredCalibr
     """Return the calibrations of a robot, the oldest first."""
     query = sa.select(calibrations).where(calibrations.c.robot_id == row)
     ordered = query.order_by(calibrations.c.valid_from, calibrations.c.id)
-    return tuple(_stored(one) for one in connection.execute(ordered))
+    return tuple(stored_calibration(one) for one in connection.execute(ordered))
 
 
-def _stored(one: Any) -> StoredCalibration:
+def stored_calibration(one: Any) -> StoredCalibration:
+    """Return the calibration of a row."""
     validity = (one.valid_from, one.valid_to)
     return StoredCalibration(one.id, one.name, one.protocol, one.document, *validity)
 

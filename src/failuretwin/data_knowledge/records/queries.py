@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -12,18 +13,24 @@ import sqlalchemy as sa
 from failuretwin.core.errors import check_name
 from failuretwin.data_knowledge.records import CHECK_DAYS
 from failuretwin.data_knowledge.records.episodes import CONFIRMED
-from failuretwin.data_knowledge.records.history import OTHER_CAUSE, WRONG
+from failuretwin.data_knowledge.records.fleet import (
+    LAST_RUN,
+    REFUTED,
+    AgeBand,
+    fleet_faults,
+    judged,
+    kinds,
+    watched_days,
+)
 from failuretwin.data_knowledge.records.schema import (
     calibrations,
     diagnoses,
     episode_events,
-    episodes,
-    findings,
-    profiles,
-    robots,
 )
-
-DAY_S = 86_400.0
+from failuretwin.data_knowledge.records.unknown_faults import (
+    read_episodes_of_unknown,
+    unknown_groups,
+)
 
 
 @dataclass(frozen=True)
@@ -41,62 +48,6 @@ class QueryAnswer:
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[Any, ...], ...]
-
-
-@dataclass(frozen=True)
-class FleetFaults:
-    """Confirmed faults of the robots of a kind.
-
-    Attributes:
-        kind: Name of their profile.
-        robots: Number of robots.
-        hours: Time from the first to the last run of each, in all [h].
-        confirmed: Number of confirmed faults by ``MOTOR:MODE``.
-    """
-
-    kind: str
-    robots: int
-    hours: float
-    confirmed: Mapping[str, int]
-
-
-# Parts of the questions: the profile in force, and the finding that stands.
-
-_last_profile = (
-    sa.select(profiles.c.robot_id, sa.func.max(profiles.c.id).label("profile"))
-    .group_by(profiles.c.robot_id)
-    .subquery()
-)
-kinds = (
-    sa.select(robots.c.id.label("robot_id"), robots.c.name.label("robot"))
-    .add_columns(sa.func.coalesce(profiles.c.name, "").label("kind"))
-    .outerjoin(_last_profile, _last_profile.c.robot_id == robots.c.id)
-    .outerjoin(profiles, profiles.c.id == _last_profile.c.profile)
-    .subquery()
-)
-"""Robots with the name of their profile."""
-_withdrawing = findings.alias("withdrawing")
-_standing = (
-    sa.select(findings.c.episode_id, sa.func.max(findings.c.id).label("finding"))
-    .where(
-        findings.c.withdraws.is_(None),
-        ~sa.exists().where(_withdrawing.c.withdraws == findings.c.id),
-    )
-    .group_by(findings.c.episode_id)
-    .subquery()
-)
-judged = (
-    sa.select(episodes, findings.c.verdict, findings.c.cause, findings.c.person)
-    .outerjoin(_standing, _standing.c.episode_id == episodes.c.id)
-    .outerjoin(findings, findings.c.id == _standing.c.finding)
-    .subquery()
-)
-"""Episodes with the finding that stands; null where there is none."""
-_of_the_robot = diagnoses.c.robot_id == kinds.c.robot_id
-FIRST_RUN = sa.select(sa.func.min(diagnoses.c.at)).where(_of_the_robot).scalar_subquery()
-LAST_RUN = sa.select(sa.func.max(diagnoses.c.at)).where(_of_the_robot).scalar_subquery()
-"""Times of the first and last run of each robot of `kinds`: one look into the index each."""
-REFUTED = judged.c.verdict.in_([WRONG, OTHER_CAUSE]).is_(True)
 
 
 def _count(condition: sa.ColumnElement[bool]) -> sa.ColumnElement[int]:
@@ -139,31 +90,6 @@ def _between(days: float, failures: int) -> float | None:
     return round(days / failures, 3) if days > 0.0 else None
 
 
-def fleet_faults(connection: sa.Connection, kind: str) -> FleetFaults:
-    """Return the confirmed faults of the robots of a kind."""
-    robot_count, days = watched_days(connection).get(kind, (0, 0.0))
-    query = (
-        sa.select(judged.c.motor, judged.c.mode, sa.func.count())
-        .join(kinds, kinds.c.robot_id == judged.c.robot_id)
-        .where(kinds.c.kind == kind, judged.c.verdict == CONFIRMED)
-        .group_by(judged.c.motor, judged.c.mode)
-        .order_by(judged.c.motor, judged.c.mode)
-    )
-    rows = connection.execute(query)
-    confirmed = {f"{motor}:{mode}": int(count) for motor, mode, count in rows}
-    return FleetFaults(kind, robot_count, 24.0 * days, confirmed)
-
-
-def watched_days(connection: sa.Connection) -> dict[str, tuple[int, float]]:
-    """Return the number of robots of each kind, and the time they were watched in all [days]."""
-    query = sa.select(kinds.c.kind, FIRST_RUN, LAST_RUN)
-    found: dict[str, tuple[int, float]] = {}
-    for kind, begin, end in connection.execute(query.where(FIRST_RUN.is_not(None))):
-        count, days = found.get(kind, (0, 0.0))
-        found[kind] = (count + 1, round(days + (end - begin).total_seconds() / DAY_S, 3))
-    return found
-
-
 def _wrong(connection: sa.Connection, now: datetime, days: float) -> list[tuple[Any, ...]]:
     first = (
         sa.select(sa.func.min(episode_events.c.diagnosis_id))
@@ -200,6 +126,31 @@ def _due(connection: sa.Connection, now: datetime, days: float) -> list[tuple[An
     return found
 
 
+def _unknown(connection: sa.Connection, now: datetime, days: float) -> list[tuple[Any, ...]]:
+    names = {row: kind for row, _, kind in connection.execute(sa.select(kinds))}
+    return [group.row for group in unknown_groups(read_episodes_of_unknown(connection), names)]
+
+
+def _by_age(connection: sa.Connection, now: datetime, days: float) -> list[tuple[Any, ...]]:
+    return [
+        (kind, motor, _ages(band), round(band.hours / 24.0, 3), count, _per_1000_h(band, count))
+        for kind in sorted(watched_days(connection))
+        for motor, bands in fleet_faults(connection, kind).by_age.items()
+        for band in bands
+        if (count := sum(band.confirmed.values())) or band.hours
+    ]
+
+
+def _ages(band: AgeBand) -> str:
+    """Return the ages of a band in words."""
+    low, high = band.low_h / 24.0, band.high_h / 24.0
+    return f"from {low:g}" if math.isinf(high) else f"{low:g} to {high:g}"
+
+
+def _per_1000_h(band: AgeBand, count: int) -> float | None:
+    return 1000.0 * count / band.hours if band.hours else None
+
+
 @dataclass(frozen=True)
 class _Question:
     title: str
@@ -218,10 +169,23 @@ QUESTIONS = {
         ("kind", "motor", "robots", "watched_days", "failures", "days_between"),
         _time_between,
     ),
+    "rates-by-age": _Question(
+        "Confirmed faults of each motor by its age, since its last repair or the first run",
+        ("kind", "motor", "age_days", "motor_days", "confirmed", "per_1000_h"),
+        _by_age,
+    ),
     "wrong-diagnoses": _Question(
         "Which diagnoses were wrong?",
         ("robot", "episode", "since", "diagnosis", "finding", "cause", "person"),
         _wrong,
+    ),
+    "unknown-faults": _Question(
+        "Which faults does no known mode explain? Each group may be a mode of its own",
+        (
+            *("kind", "motor", "episodes", "runs", "robots", "size", "sign", "law"),
+            *("since", "until", "alike"),
+        ),
+        _unknown,
     ),
     "due": _Question("Which robots are due for a check?", ("robot", "last_run", "why"), _due),
 }

@@ -16,8 +16,14 @@ from failuretwin.data_knowledge.records.beliefs import (
 from failuretwin.data_knowledge.records.checking import StoreCheck, checked
 from failuretwin.data_knowledge.records.database import Database
 from failuretwin.data_knowledge.records.export import export_parquet
+from failuretwin.data_knowledge.records.fleet import (
+    FleetFaults,
+    fleet_calibrations,
+    fleet_faults,
+    motor_ages,
+)
 from failuretwin.data_knowledge.records.history import History, StoredCalibration, read_history
-from failuretwin.data_knowledge.records.queries import FleetFaults, QueryAnswer, ask, fleet_faults
+from failuretwin.data_knowledge.records.queries import QueryAnswer, ask
 from failuretwin.data_knowledge.records.schema import robots
 from failuretwin.data_knowledge.records.statements import calibration_in_force
 
@@ -77,7 +83,8 @@ class StoreReader:
         """Return the answer to a ready question.
 
         Args:
-            name: ``failing-motors``, ``time-between-failures``, ``wrong-diagnoses`` or ``due``.
+            name: ``failing-motors``, ``time-between-failures``, ``rates-by-age``,
+                ``wrong-diagnoses``, ``unknown-faults`` or ``due``.
             days: Time without a run after which a robot is due [days].
 
         Raises:
@@ -94,6 +101,24 @@ class StoreReader:
         """
         with self._database.reading() as connection:
             return fleet_faults(connection, kind)
+
+    def motor_ages(self, robot: str) -> dict[str, float]:
+        """Return the age of each motor of a robot at its last run [h].
+
+        Empty: the store does not know the robot, or no run or profile of it.
+        """
+        with self._database.reading() as connection:
+            row = _row_of(connection, robot)
+            return {} if row is None else motor_ages(connection, row)
+
+    def fleet_calibrations(self, kind: str) -> dict[str, StoredCalibration]:
+        """Return the calibrations in force of all robots of a kind, each file once, by robot.
+
+        Args:
+            kind: Name of their profile.
+        """
+        with self._database.reading() as connection:
+            return fleet_calibrations(connection, kind)
 
     def export(self, folder: str | Path) -> dict[str, int]:
         """Write every table to ``TABLE.parquet`` in a folder, and return the numbers of rows.

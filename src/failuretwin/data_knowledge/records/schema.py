@@ -272,6 +272,20 @@ beliefs = sa.Table(
 )
 """Posterior of theta of a robot after a session, its new runs, and the start of it all."""
 
+residuals = sa.Table(
+    "residuals",
+    metadata,
+    _key(),
+    sa.Column("diagnosis_id", Id, sa.ForeignKey("diagnoses.id"), nullable=False, index=True),
+    _of("robots"),
+    _needed("at", Utc),
+    _needed("motor", Text),
+    _needed("unit", Text),
+    _needed("movements", Json),
+)
+"""Displacements of a motor where `unknown` is most probable, a list a quantity; see
+`core.hypothesis.MotorResidual`."""
+
 repairs = sa.Table(
     "repairs",
     metadata,

@@ -37,6 +37,7 @@ from failuretwin.data_knowledge.records.schema import (
     sessions,
     storable,
 )
+from failuretwin.data_knowledge.records.unknown_faults import add_residuals
 from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.digital_model.robot import Robot
 
@@ -191,7 +192,10 @@ def add_diagnoses(
     """Store diagnoses of runs, and return their rows."""
     of = {"robot_id": rows.robot, "session_id": rows.session}
     stated = [{**_diagnosis_row(one, digest, at), **of, "run_id": run} for one, run, digest in kept]
-    return add_rows(connection, diagnoses, stated)
+    added = add_rows(connection, diagnoses, stated)
+    found = [(row, at, one) for row, (one, _, _) in zip(added, kept, strict=True)]
+    add_residuals(connection, rows.robot, found)
+    return added
 
 
 def add_session_diagnoses(
@@ -203,8 +207,11 @@ def add_session_diagnoses(
     of = {"robot_id": rows.robot, "session_id": rows.session, "run_id": rows.run}
     kept = [(at, one) for at, one in found if one is not None]
     stated = [{**_diagnosis_row(one, _digest_of(one, None), at), **of} for at, one in kept]
-    added = iter(add_rows(connection, diagnoses, stated))
-    return [None if one is None else next(added) for _, one in found]
+    added = add_rows(connection, diagnoses, stated)
+    known = [(row, *one) for row, one in zip(added, kept, strict=True)]
+    add_residuals(connection, rows.robot, known)
+    numbers = iter(added)
+    return [None if one is None else next(numbers) for _, one in found]
 
 
 def _digest_of(diagnosis: Diagnosis, calibration: int | None) -> str:
