@@ -157,7 +157,7 @@ class BayesDiagnoser:
                 to be believed, or no run holds a movement.
         """
         runs = as_runs(runs, self.twin.robot)
-        self._check(runs)
+        self.check(runs)
         count = runs.sizes["run"]
         if count <= PART_RUNS:
             return self.prepare(runs).diagnose(runs)
@@ -178,7 +178,7 @@ class BayesDiagnoser:
 
     def seen(self, runs: xr.Dataset) -> SeenRuns:
         """Return runs as this diagnoser sees them, set up as told; raises as `diagnose` does."""
-        self._check(runs)
+        self.check(runs)
         model = self.healthy_model.seen_by(sensing_of(runs, self.sensing))
         self._check_shown(model)
         found = SeenRuns(runs, model, self.hypothesis_set, self.priors, self.whole_run)
@@ -206,7 +206,8 @@ class BayesDiagnoser:
                     f"{'+'.join(model.sensing)}). Leave out encoders, or that fault."
                 )
 
-    def _check(self, runs: xr.Dataset) -> None:
+    def check(self, runs: xr.Dataset) -> None:
+        """Raise InputError unless a run set is one of this robot, and holds the known onset."""
         check_runs(runs, "the run set")
         check_motors(runs, self.twin.robot.name, self.twin.robot.motor_names)
         known, end = self.priors.onset.known_s, float(runs["time"].values[-1])
