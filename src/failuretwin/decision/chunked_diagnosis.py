@@ -28,6 +28,8 @@ from failuretwin.decision.parquet_results import (
     write_part,
 )
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.explanation import with_reading_doubt
+from failuretwin.inference.observation.computed_tool import is_computed
 from failuretwin.inference.prepared import PreparedDiagnoser, parts_of
 from failuretwin.inference.set_ups.log_correction import LogCorrection
 
@@ -149,7 +151,7 @@ class UnfinishedResults(Unfinished):
             OSError: If the file cannot be written.
         """
         self.check_worker()
-        prepared, runs = self._prepared, self.runs.read(piece)
+        (prepared, computed), runs = self._prepared, self.runs.read(piece)
         if self.correction is not None:
             runs = self.correction.runs(runs)
         self.bayes.check(runs)
@@ -159,17 +161,23 @@ class UnfinishedResults(Unfinished):
             for part in parts
             for diagnosis in prepared.diagnose(runs.isel(run=slice(part.start, part.stop)))
         ]
+        if computed:
+            found = [with_reading_doubt(one, one.diagnosis or "") for one in found]
         write_part(found, [str(h) for h in self.bayes.hypothesis_set], *self.files(piece))
         return self.mark(piece)
 
     @property
-    def _prepared(self) -> PreparedDiagnoser:
-        """The diagnoser whose set-up is judged, which a process works out once."""
+    def _prepared(self) -> tuple[PreparedDiagnoser, bool]:
+        """The diagnoser whose set-up is judged, and whether tool paths are computed.
+
+        A process works them out once.
+        """
         if _known.get("identity") != self.identity:
             sample = self.runs.sample()
             if self.correction is not None:
                 sample = self.correction.runs(sample)
-            _known.update(identity=self.identity, prepared=self.bayes.prepare(sample))
+            found = self.bayes.prepare(sample), is_computed(sample, self.bayes.twin)
+            _known.update(identity=self.identity, prepared=found)
         return _known["prepared"]
 
     def finish(self, content: str, path: Path) -> None:
@@ -195,4 +203,4 @@ class UnfinishedResults(Unfinished):
 
 
 _known: dict[str, Any] = {}
-"""The diagnoser that this process has prepared last."""
+"""What this process has prepared last."""
