@@ -70,6 +70,9 @@ def diagnose_to_parquet(
     check_parquet()
     _check_results_folder(folder)
     manifest = _manifest(runs, bayes, correction)
+    if _is_complete(folder, fingerprint(manifest), len(runs.pieces)):
+        tell(f"{folder}: holds these results already")
+        return
     carry_out(
         lambda hidden: UnfinishedResults(
             hidden, versions(*PACKAGES), runs, bayes, correction, fingerprint(manifest)
@@ -91,6 +94,16 @@ def _check_results_folder(folder: Path) -> None:
             f"{folder}: is a folder that holds something else than results. It is left alone; "
             "choose another name."
         )
+
+
+def _is_complete(folder: Path, identity: str, pieces: int) -> bool:
+    """Return whether a folder holds the results of the same runs, options and versions."""
+    try:
+        stated = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    there = all((folder / part_name(piece)).is_file() for piece in range(pieces))
+    return there and isinstance(stated, dict) and stated.get("identity") == identity
 
 
 def _manifest(
