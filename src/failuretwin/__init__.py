@@ -32,9 +32,11 @@ if TYPE_CHECKING:
     from failuretwin.data_knowledge.generate import Plan, iterate, simulate
     from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs, sample_log
     from failuretwin.data_knowledge.records.store import Store, open_store
+    from failuretwin.data_knowledge.workers import Workforce
     from failuretwin.decision.acting.reach import reach
     from failuretwin.decision.acting.session import act
     from failuretwin.decision.acting.task import Target, Task
+    from failuretwin.decision.chunked_diagnosis import diagnose_to_parquet
     from failuretwin.decision.evaluation import compare, evaluate
     from failuretwin.decision.expected_cost import advise
     from failuretwin.decision.learned.log_pool import HybridDiagnoser
@@ -93,12 +95,14 @@ _HOME = {
     "StreamingFleet": "decision.streaming.fleet",
     "Target": "decision.acting.task",
     "Task": "decision.acting.task",
+    "Workforce": "data_knowledge.workers",
     "act": "decision.acting.session",
     "advise": "decision.expected_cost",
     "calibrate": "connection.calibration.calibrate",
     "check": "decision.test_motions.health_check",
     "compare": "decision.evaluation",
     "diagnose": "inference.diagnoser",
+    "diagnose_to_parquet": "decision.chunked_diagnosis",
     "emulated_arm": "app.arms",
     "evaluate": "decision.evaluation",
     "isolability": "inference.isolability",
@@ -156,6 +160,7 @@ __all__ = [
     "StreamingFleet",
     "Target",
     "Task",
+    "Workforce",
     "__version__",
     "act",
     "advise",
@@ -163,6 +168,7 @@ __all__ = [
     "check",
     "compare",
     "diagnose",
+    "diagnose_to_parquet",
     "emulated_arm",
     "evaluate",
     "isolability",

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from failuretwin.app.terminal import tell
+from failuretwin.app.terminal import progress_bar, tell
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, parse_hypotheses
@@ -18,7 +18,7 @@ from failuretwin.data_knowledge.readers.column_map import CORRECTION, read_colum
 from failuretwin.data_knowledge.readers.lerobot import is_lerobot, lerobot_map_text
 from failuretwin.data_knowledge.readers.lerobot_units import GUESSED, LeRobotAngles
 from failuretwin.data_knowledge.readers.matlab import RECOVERY_ERROR, RECOVERY_WORST
-from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
+from failuretwin.data_knowledge.readers.read import ReadOptions, find_logs, read_logs
 from failuretwin.data_knowledge.store import write_text
 from failuretwin.data_knowledge.workers import ONE_PROCESS, Workforce
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
@@ -61,7 +61,9 @@ def read_inputs(
         InputError: If they cannot be read.
     """
     options, correction = with_map(options, columns, logs, robot)
-    runs = read_runs(list(logs), robot, options, workforce or ONE_PROCESS)
+    found = find_logs(logs, options)
+    with progress_bar("reading logs", len(found)) as advance:
+        runs = read_logs(found, robot, options, workforce or ONE_PROCESS, advance)
     if correction is not None:
         runs = correction.runs(runs)
     source = str(runs.attrs.get("source", ""))

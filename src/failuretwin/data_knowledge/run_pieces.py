@@ -16,7 +16,13 @@ import numpy as np
 
 from failuretwin.core.foreign import files_below
 from failuretwin.core.runs import check_runs, concatenate
-from failuretwin.data_knowledge.readers.read import Log, ReadOptions, find_logs, read_log
+from failuretwin.data_knowledge.readers.read import (
+    Log,
+    ReadOptions,
+    find_logs,
+    read_log,
+    read_logs,
+)
 from failuretwin.data_knowledge.store import open_run_set
 from failuretwin.digital_model.robot import Robot
 
@@ -118,6 +124,17 @@ class RunPieces:
         logs = dict.fromkeys(log.path for piece in self.pieces for log in piece.logs)
         files = [f for p in logs for f in (sorted(files_below(p, "*")) if p.is_dir() else [p])]
         return [(str(f.absolute()), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+
+
+def open_runs(source: Path, robot: Robot, options: ReadOptions) -> xr.Dataset:
+    """Return runs; of one stored run set only the variables that are asked for are read.
+
+    Raises:
+        InputError: If they cannot be read.
+    """
+    logs = find_logs([source], options)
+    stored = len(logs) == 1 and logs[0].is_run_set
+    return _opened(source) if stored else read_logs(logs, robot, options)
 
 
 def _is_run_set(log: Log) -> bool:

@@ -17,6 +17,7 @@ from failuretwin.core.config import fingerprint
 from failuretwin.core.errors import OutputError
 from failuretwin.core.runs import unique_names
 from failuretwin.data_knowledge.pieces import Unfinished, carry_out, versions
+from failuretwin.data_knowledge.readers.read import ReadOptions
 from failuretwin.data_knowledge.run_pieces import RunPieces
 from failuretwin.data_knowledge.store import atomic_replace, check_fillable
 from failuretwin.data_knowledge.workers import ONE_PROCESS, Workforce
@@ -39,9 +40,9 @@ PACKAGES = ("numpy", "scipy", "xarray", "zarr", "pyarrow")
 
 
 def diagnose_to_parquet(
-    runs: RunPieces,
+    runs: RunPieces | str | Path | Sequence[str | Path],
     bayes: BayesDiagnoser,
-    folder: Path,
+    folder: str | Path,
     correction: LogCorrection | None = None,
     workforce: Workforce = ONE_PROCESS,
     on_progress: Callable[[int], None] = lambda runs: None,
@@ -54,11 +55,12 @@ def diagnose_to_parquet(
     folder beside it, from which the same call continues.
 
     Args:
-        runs: The runs.
+        runs: The runs, or the path of anything that `read_runs` reads.
         bayes: The diagnoser.
         folder: Where the results go; a folder of results of that name is replaced at the end.
         correction: Set-up to undo in all runs; None: none.
-        workforce: Processes that do the work; the results do not depend on them.
+        workforce: Processes that do the work, such as ``ft.Workforce(4)``; the results do not
+            depend on them.
         on_progress: Called with the number of further runs (or logs) that are finished.
         tell: Called with one line about an earlier attempt, or about this one if it fails.
 
@@ -68,7 +70,23 @@ def diagnose_to_parquet(
         OutputError: If the results cannot be written.
     """
     check_parquet()
+    folder = Path(folder)
     _check_results_folder(folder)
+    if not isinstance(runs, RunPieces):
+        sources = [runs] if isinstance(runs, str | Path) else runs
+        runs = RunPieces([Path(source) for source in sources], bayes.twin.robot, ReadOptions())
+    _diagnose(runs, bayes, folder, correction, workforce, on_progress, tell)
+
+
+def _diagnose(
+    runs: RunPieces,
+    bayes: BayesDiagnoser,
+    folder: Path,
+    correction: LogCorrection | None,
+    workforce: Workforce,
+    on_progress: Callable[[int], None],
+    tell: Callable[[str], None],
+) -> None:
     manifest = _manifest(runs, bayes, correction)
     if _is_complete(folder, fingerprint(manifest), len(runs.pieces)):
         tell(f"{folder}: holds these results already")

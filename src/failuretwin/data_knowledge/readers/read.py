@@ -114,8 +114,33 @@ def read_runs(
         sources = [sources]
     options = options or ReadOptions()
     logs = find_logs([Path(source) for source in sources], options)
+    return read_logs(logs, robot, options, workforce)
+
+
+def read_logs(
+    logs: Sequence[Log],
+    robot: Robot,
+    options: ReadOptions,
+    workforce: Workforce = ONE_PROCESS,
+    on_progress: Callable[[int], None] = lambda logs: None,
+) -> xr.Dataset:
+    """Return the runs of some logs as one run set.
+
+    Args:
+        logs: The logs, from `find_logs`.
+        robot: The robot that they are of.
+        options: How logs become runs.
+        workforce: Processes that read them, each log once; the runs do not depend on them.
+        on_progress: Called with the number of further logs that have been read.
+
+    Raises:
+        InputError: If a log cannot be read.
+    """
+    parts: list[xr.Dataset] = []
     with workforce.map(partial(read_log, robot=robot, options=options), logs) as found:
-        parts = [part for several in found for part in several]
+        for some in found:
+            parts += some
+            on_progress(1)
     runs = concatenate(parts)
     worst = max(parts, key=lambda part: float(part.attrs.get(RECOVERY_ERROR, -1.0)))
     if RECOVERY_ERROR in worst.attrs:  # the worst of several files is reported
