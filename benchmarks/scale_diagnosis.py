@@ -19,7 +19,6 @@ from pathlib import Path
 import failuretwin as ft
 from failuretwin.data_knowledge.resumable import produce
 from failuretwin.data_knowledge.run_pieces import RunPieces
-from failuretwin.data_knowledge.workers import Workforce
 from failuretwin.decision.chunked_diagnosis import diagnose_to_parquet
 from failuretwin.failure_behavior.random_movements import RandomMovements
 
@@ -49,7 +48,7 @@ def measure(path: Path, full: bool, workers: int, out: Path) -> None:
     bayes = diagnoser(full)
     begun_s = time.perf_counter()
     runs = RunPieces((path,), bayes.twin.robot, ft.ReadOptions())
-    diagnose_to_parquet(runs, bayes, out, workforce=Workforce(workers))
+    diagnose_to_parquet(runs, bayes, out, workers=workers)
     seconds = time.perf_counter() - begun_s
     kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     peaks = (resource.getrusage(kind).ru_maxrss / 1024.0 for kind in kinds)

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from failuretwin.data_knowledge.generate import Plan, iterate, simulate
     from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs, sample_log
     from failuretwin.data_knowledge.records.store import Store, open_store
-    from failuretwin.data_knowledge.workers import Workforce
     from failuretwin.decision.acting.reach import reach
     from failuretwin.decision.acting.session import act
     from failuretwin.decision.acting.task import Target, Task
@@ -95,7 +94,6 @@ _HOME = {
     "StreamingFleet": "decision.streaming.fleet",
     "Target": "decision.acting.task",
     "Task": "decision.acting.task",
-    "Workforce": "data_knowledge.workers",
     "act": "decision.acting.session",
     "advise": "decision.expected_cost",
     "calibrate": "connection.calibration.calibrate",
@@ -160,7 +158,6 @@ __all__ = [
     "StreamingFleet",
     "Target",
     "Task",
-    "Workforce",
     "__version__",
     "act",
     "advise",

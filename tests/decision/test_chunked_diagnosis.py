@@ -236,8 +236,7 @@ def test_more_runs_than_memory_holds_can_be_opened(tmp_path, zarr, runs, monkeyp
 
 
 def test_other_processes_write_the_same_bytes(tmp_path, zarr, bayes, results, scheduler):
-    force = Workforce(scheduler=scheduler)
-    diagnose_to_parquet(pieces_of(zarr), bayes, tmp_path / "two", workforce=force)
+    diagnose_to_parquet(pieces_of(zarr), bayes, tmp_path / "two", scheduler=scheduler)
     assert contents(tmp_path / "two") == contents(results)
 
 

@@ -47,7 +47,8 @@ def diagnose_many(
             bayes,
             folder,
             correction,
-            workforce,
+            workforce.workers,
+            workforce.scheduler,
             advance,
             tell=lambda text: tell(text, err=True),
         )

@@ -20,7 +20,7 @@ from failuretwin.data_knowledge.pieces import Unfinished, carry_out, versions
 from failuretwin.data_knowledge.readers.read import ReadOptions
 from failuretwin.data_knowledge.run_pieces import RunPieces
 from failuretwin.data_knowledge.store import atomic_replace, check_fillable
-from failuretwin.data_knowledge.workers import ONE_PROCESS, Workforce
+from failuretwin.data_knowledge.workers import Workforce
 from failuretwin.decision.parquet_results import (
     check_parquet,
     part_name,
@@ -44,7 +44,8 @@ def diagnose_to_parquet(
     bayes: BayesDiagnoser,
     folder: str | Path,
     correction: LogCorrection | None = None,
-    workforce: Workforce = ONE_PROCESS,
+    workers: int = 1,
+    scheduler: str | None = None,
     on_progress: Callable[[int], None] = lambda runs: None,
     tell: Callable[[str], None] = lambda text: None,
 ) -> None:
@@ -59,8 +60,9 @@ def diagnose_to_parquet(
         bayes: The diagnoser.
         folder: Where the results go; a folder of results of that name is replaced at the end.
         correction: Set-up to undo in all runs; None: none.
-        workforce: Processes that do the work, such as ``ft.Workforce(4)``; the results do not
-            depend on them.
+        workers: Processes to spread the work over; the results do not depend on it. Scripts that
+            ask for several must be guarded by ``if __name__ == "__main__":``.
+        scheduler: Address of a Dask scheduler whose workers do it instead.
         on_progress: Called with the number of further runs (or logs) that are finished.
         tell: Called with one line about an earlier attempt, or about this one if it fails.
 
@@ -70,7 +72,7 @@ def diagnose_to_parquet(
         OutputError: If the results cannot be written.
     """
     check_parquet()
-    folder = Path(folder)
+    folder, workforce = Path(folder), Workforce(workers, scheduler)
     _check_results_folder(folder)
     if not isinstance(runs, RunPieces):
         sources = [runs] if isinstance(runs, str | Path) else runs

@@ -177,8 +177,7 @@ class RunsTogether:
     ) -> BoolArray:
         """Take in what runs say: sites, scatter, rates.
 
-        What was worked out to judge them is dropped as soon as a site is there: it takes a thousand
-        times as much memory.
+        What was worked out to judge them is dropped as soon as a site is there.
 
         Args:
             found: What they say.
