@@ -68,7 +68,7 @@ from failuretwin.inference.together.folder_posterior import (
 from failuretwin.inference.together.mixed_runs import of_second_robot, two_robots
 
 RUN_BYTES = 2.2e6
-"""Memory that self-calibration takes for each run, by peaks of 32 and 128 runs of the ArmPi FPV with
+"""Memory that self-calibration takes for each run, by peaks of 32 and 128 runs of the ArmPi FPV and
 nine hypotheses [bytes]."""
 LATE_LOSSES = 4.0
 """How many times as often a movement that starts late loses its command, where nobody has counted:
