@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from failuretwin.decision.acting.reach import reach
     from failuretwin.decision.acting.session import act
     from failuretwin.decision.acting.task import Target, Task
+    from failuretwin.decision.chunked_diagnosis import diagnose_to_parquet
     from failuretwin.decision.evaluation import compare, evaluate
     from failuretwin.decision.expected_cost import advise
     from failuretwin.decision.learned.log_pool import HybridDiagnoser
@@ -99,6 +100,7 @@ _HOME = {
     "check": "decision.test_motions.health_check",
     "compare": "decision.evaluation",
     "diagnose": "inference.diagnoser",
+    "diagnose_to_parquet": "decision.chunked_diagnosis",
     "emulated_arm": "app.arms",
     "evaluate": "decision.evaluation",
     "isolability": "inference.isolability",
@@ -163,6 +165,7 @@ __all__ = [
     "check",
     "compare",
     "diagnose",
+    "diagnose_to_parquet",
     "emulated_arm",
     "evaluate",
     "isolability",

@@ -17,13 +17,13 @@ import xarray as xr
 from failuretwin import read_runs
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge import resumable
+from failuretwin.data_knowledge import pieces, resumable
 from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.data_knowledge.pieces import versions
 from failuretwin.data_knowledge.resumable import (
     UnfinishedRunSet,
     make_chunk,
     produce,
-    versions,
 )
 from failuretwin.data_knowledge.store import load_run_set, save_run_set, sole_writer
 from failuretwin.data_knowledge.workers import ONE_PROCESS
@@ -192,7 +192,7 @@ def test_another_plan_starts_over(monkeypatch, tmp_path, imperfect, change):
 def test_other_versions_start_over(monkeypatch, tmp_path, imperfect):
     cut_short(imperfect, tmp_path / "runs.zarr", 2, monkeypatch)
     made = counting(monkeypatch)
-    monkeypatch.setattr(resumable, "__version__", "0.0.0")
+    monkeypatch.setattr(pieces, "__version__", "0.0.0")
     produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
     assert made == [0, 1, 2, 3, 4]
 
@@ -296,7 +296,7 @@ def test_a_lock_is_for_one_run_set_and_ends_with_its_block(tmp_path):
 
 def started(plan, folder):
     """Return a job as workers get it."""
-    job = UnfinishedRunSet(plan, folder / ".runs.zarr.partial", PIECE, versions())
+    job = UnfinishedRunSet(folder / ".runs.zarr.partial", versions(), plan, PIECE)
     job.begin()
     return job
 

@@ -11,7 +11,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.inference import diagnoser as bayes
+from failuretwin.inference import prepared
 from failuretwin.inference.faults import fault_sizes, stuck
 from failuretwin.inference.faults.priors import Priors, priors_of
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -111,7 +111,7 @@ def test_a_run_is_judged_alone(monkeypatch, twin, few, told_of_few):
     backwards = BayesDiagnoser(twin).diagnose(some.isel(run=slice(None, None, -1)))
     twice = few.isel(run=[3, 3, 11]).assign_coords(run=["a", "b", "c"])
     again = BayesDiagnoser(twin).diagnose(twice)
-    monkeypatch.setattr(bayes, "CHUNK_RUNS", 1)
+    monkeypatch.setattr(prepared, "CHUNK_RUNS", 1)
     singly = BayesDiagnoser(twin).diagnose(some)
 
     expected = posteriors(told_of_few)
@@ -217,7 +217,7 @@ def test_finer_quadrature_changes_no_posterior(monkeypatch, twin, few, onset_s):
     coarse = posteriors(diagnoser.diagnose(one_of_each))
     monkeypatch.setattr(stuck, "COARSE_NODES", 601)
     monkeypatch.setattr(fault_sizes, "ERROR_NODES", 150)
-    monkeypatch.setattr(bayes, "CHUNK_RUNS", 3)
+    monkeypatch.setattr(prepared, "CHUNK_RUNS", 3)
     np.testing.assert_allclose(posteriors(diagnoser.diagnose(one_of_each)), coarse, atol=0.02)
 
 

@@ -20,7 +20,7 @@ from failuretwin.digital_model.nonidealities import (
 from failuretwin.failure_behavior.modes import SteadyStateError
 from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference import diagnoser as bayes
+from failuretwin.inference import prepared
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import settled_evidence
@@ -95,10 +95,10 @@ def test_runs_of_forty_movements_are_diagnosed(armpi, twin):
 
 def test_long_runs_are_weighed_a_few_at_a_time():
     """What nodes of drift take grows with the square of the movements."""
-    assert bayes._runs_at_a_time(0) == bayes._runs_at_a_time(5) == bayes.CHUNK_RUNS
-    assert bayes._runs_at_a_time(60) == 1
-    taken = [bayes._runs_at_a_time(count) * count**2 for count in range(5, 40)]
-    assert max(taken) <= 25 * bayes.CHUNK_RUNS
+    assert prepared.runs_at_a_time(0) == prepared.runs_at_a_time(5) == prepared.CHUNK_RUNS
+    assert prepared.runs_at_a_time(60) == 1
+    taken = [prepared.runs_at_a_time(count) * count**2 for count in range(5, 40)]
+    assert max(taken) <= 25 * prepared.CHUNK_RUNS
 
 
 @pytest.fixture(scope="module")

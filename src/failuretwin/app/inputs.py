@@ -8,21 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from failuretwin.app.terminal import tell
+from failuretwin.app.terminal import progress_bar, tell
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, parse_hypotheses
-from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.readers.bag_messages import BagTopics
 from failuretwin.data_knowledge.readers.column_guess import column_map_text
 from failuretwin.data_knowledge.readers.column_map import CORRECTION, read_column_map
 from failuretwin.data_knowledge.readers.lerobot import is_lerobot, lerobot_map_text
 from failuretwin.data_knowledge.readers.lerobot_units import GUESSED, LeRobotAngles
 from failuretwin.data_knowledge.readers.matlab import RECOVERY_ERROR, RECOVERY_WORST
-from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
+from failuretwin.data_knowledge.readers.read import ReadOptions, find_logs, read_logs
 from failuretwin.data_knowledge.store import write_text
+from failuretwin.data_knowledge.workers import ONE_PROCESS, Workforce
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, class_name
 from failuretwin.digital_model.robot import Robot
@@ -30,6 +28,7 @@ from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser, diagnoser_from_text
 from failuretwin.inference.explanation import with_reading_doubt
+from failuretwin.inference.observation.computed_tool import is_computed
 from failuretwin.inference.posterior import check_diagnosable
 from failuretwin.inference.set_ups.log_correction import CorrectionTable, LogCorrection
 
@@ -43,17 +42,28 @@ REPORTED_ERROR_M = 1e-6
 
 
 def read_inputs(
-    logs: Sequence[Path], robot: Robot, options: ReadOptions, columns: Path | None
+    logs: Sequence[Path],
+    robot: Robot,
+    options: ReadOptions,
+    columns: Path | None,
+    workforce: Workforce | None = None,
 ) -> xr.Dataset:
     """Return the runs of all logs as one run set, read with the map of `columns` if there is one.
+
+    Args:
+        logs: The logs.
+        robot: The robot that they are of.
+        options: How they become runs.
+        columns: The map; None: there is none.
+        workforce: Processes that read them; None: this one.
 
     Raises:
         InputError: If they cannot be read.
     """
-    correction = None
-    if columns is not None:
-        options, correction = _with_map(options, columns, logs, robot)
-    runs = read_runs(list(logs), robot, options)
+    options, correction = with_map(options, columns, logs, robot)
+    found = find_logs(logs, options)
+    with progress_bar("reading logs", len(found)) as advance:
+        runs = read_logs(found, robot, options, workforce or ONE_PROCESS, advance)
     if correction is not None:
         runs = correction.runs(runs)
     source = str(runs.attrs.get("source", ""))
@@ -69,27 +79,13 @@ def read_inputs(
     return runs
 
 
-SAME_PLACE_M = 1e-6
-"""Rounding error of a tool path that is computed from motor readings [m]."""
-
-
 def with_doubts(
     diagnoses: Sequence[Diagnosis], runs: xr.Dataset, twin: DigitalTwin
 ) -> list[Diagnosis]:
     """Return diagnoses with a caveat if the tool path was computed from motor readings."""
-    if not _is_computed(runs, twin):
+    if not is_computed(runs, twin):
         return list(diagnoses)
     return [with_reading_doubt(one, one.diagnosis or "") for one in diagnoses]
-
-
-def _is_computed(runs: xr.Dataset, twin: DigitalTwin) -> bool:
-    """Return whether the tool of some logs is computed from the motors' own readings."""
-    if "position" not in runs or str(runs.attrs.get("source", "")).startswith("simulated"):
-        return False
-    position, measured = (as_floats(runs[name].values) for name in ("position", "measured"))
-    both = np.isfinite(position).all(axis=-1) & np.isfinite(measured).all(axis=-1)
-    off = np.abs(twin.path(position[both]) - measured[both])
-    return bool(both.any() and np.median(off.max(axis=-1)) < SAME_PLACE_M)
 
 
 def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
@@ -106,14 +102,16 @@ def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
         )
 
 
-def _with_map(
-    options: ReadOptions, path: Path, logs: Sequence[Path], robot: Robot
+def with_map(
+    options: ReadOptions, path: Path | None, logs: Sequence[Path], robot: Robot
 ) -> tuple[ReadOptions, LogCorrection | None]:
     """Return the options with a map of columns, topics or angles, and the correction in it.
 
     Raises:
         InputError: If the map cannot be read. If there is no such file yet, a guess is written.
     """
+    if path is None:
+        return options, None
     if not path.exists():
         raise _guessed(path, logs, robot)
     if path.suffix == ".json":

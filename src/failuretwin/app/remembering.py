@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from failuretwin.app.commands.options import LogOptions
+    from failuretwin.data_knowledge.workers import Workforce
     from failuretwin.decision.test_motions.health_check import CheckResult
 
 
@@ -244,9 +245,9 @@ class DiagnosisKeeper:
         """When the last log was recorded (UTC)."""
         return max(log.recorded for log in self.logs)
 
-    def runs(self, robot: Robot) -> xr.Dataset:
+    def runs(self, robot: Robot, workforce: Workforce) -> xr.Dataset:
         """Return the runs of all logs as one run set."""
-        self._parts = self._reading.parts(robot)
+        self._parts = self._reading.parts(robot, workforce)
         return concatenate(self._parts)
 
     def remember(self, diagnoses: Sequence[Diagnosis]) -> list[str]:

@@ -22,6 +22,7 @@ from failuretwin.connection.calibration.result import SETTLING_UNITS, Calibratio
 from failuretwin.connection.calibration.timing_fit import gap_starts, lateness
 from failuretwin.connection.population import Population, stated_variation
 from failuretwin.core.errors import InputError, counted
+from failuretwin.core.foreign import check_memory
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import check_motors, truths_of
@@ -66,6 +67,9 @@ from failuretwin.inference.together.folder_posterior import (
 )
 from failuretwin.inference.together.mixed_runs import of_second_robot, two_robots
 
+RUN_BYTES = 2.2e6
+"""Memory that self-calibration takes for each run, by peaks of 32 and 128 runs of the ArmPi FPV and
+nine hypotheses [bytes]."""
 LATE_LOSSES = 4.0
 """How many times as often a movement that starts late loses its command, where nobody has counted:
 a stalled bus does both; assumed."""
@@ -162,6 +166,8 @@ class SelfCalibratingDiagnoser:
         robot = self.twin.robot
         runs = as_runs(runs, robot)
         check_motors(runs, robot.name, robot.motor_names)
+        count = runs.sizes["run"]
+        check_memory(RUN_BYTES * count, "the runs", f"self-calibration by {count} runs")
         movements = Evidence(runs).settled.movements
         check_moves(movements)
         believed = self._population(runs, movements)

@@ -220,6 +220,14 @@ def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:
     Raises:
         InputError: With the first violation and the expected value.
     """
+    check_layout(runs, where)
+    _check_values(runs, where)
+    check_duration(runs, where)
+    return runs
+
+
+def check_layout(runs: xr.Dataset, where: str) -> None:
+    """Raise InputError unless names, dimensions and grid are right; reads no values of the runs."""
     _check_variables(runs, where)
     if runs.sizes["run"] == 0:
         raise InputError(f"{where}: holds no runs. Expected at least one.")
@@ -232,11 +240,9 @@ def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:
             raise InputError(
                 f"{where}: {coordinate} names are not unique. Rename those that repeat."
             )
-    check_duration(runs, where)
     rate = runs.attrs.get("measured_rate_hz", 1.0)
     if not (isinstance(rate, int | float | np.number) and 0.0 < rate < np.inf):
         raise InputError(f"{where}: `measured_rate_hz` is {rate!r}, expected a rate above 0 [Hz].")
-    return runs
 
 
 def check_motors(runs: xr.Dataset, robot: str, names: Sequence[str]) -> None:
@@ -265,7 +271,6 @@ def _check_variables(runs: xr.Dataset, where: str) -> None:
             raise InputError(
                 f"{where}: `{name}` has dimensions {runs[name].dims}, expected {dims}."
             )
-    _check_values(runs, where)
 
 
 def _check_values(runs: xr.Dataset, where: str) -> None:

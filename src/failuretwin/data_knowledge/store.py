@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from failuretwin.core.errors import InputError, OutputError, reason
 from failuretwin.core.foreign import reading
-from failuretwin.core.runs import check_duration, check_runs, time_step
+from failuretwin.core.runs import check_duration, check_layout, check_runs, time_step
 from failuretwin.data_knowledge.readers.file_claims import check_netcdf, check_zarr
 
 if TYPE_CHECKING:
@@ -47,6 +47,30 @@ def load_run_set(path: Path) -> xr.Dataset:
             # A step more is accepted: thinning of the grid may have kept the length.
             check_duration(runs, str(path), float(runs["time"].values[-1]) + time_step(runs))
             return runs
+
+
+def open_run_set(path: Path, most_runs: int) -> xr.Dataset:
+    """Open a stored run set of any size; values are read when they are asked for.
+
+    What the file claims is checked; the values of the runs are not.
+
+    Args:
+        path: The run set.
+        most_runs: The most runs that will be in memory at a time.
+
+    Raises:
+        InputError: If the file cannot be read, is not a run set, claims more than it can mean, or
+            has a codec that this package does not write.
+    """
+    with reading(path, "a run set", EXPECTED):
+        if path.suffix == ".nc":
+            check_netcdf(path, most_runs)
+            opened = _open_netcdf(path)
+        else:
+            check_zarr(path, most_runs)
+            opened = _open_zarr(path)
+        check_layout(opened, str(path))
+        return opened
 
 
 def _open_netcdf(path: Path) -> xr.Dataset:

@@ -15,6 +15,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import as_cell, check_memory, reading, stored_bytes
 from failuretwin.core.hypothesis import Diagnosis, Interval
 from failuretwin.data_knowledge.store import replacing, write_records
+from failuretwin.decision.parquet_results import read_diagnoses
 from failuretwin.inference.together.fault_course import FaultCourse
 
 SUM_ERROR = 1e-6
@@ -101,11 +102,17 @@ def _with_course(
 def read_results(path: str | Path) -> Results:
     """Read a file of `write_json_lines`, or of another program with the same keys.
 
-    Missing and null values are unknown; other keys than those of `Record` are ignored.
+    Missing and null values are unknown; other keys than those of `Record` are ignored. Of a folder
+    of parquet files, all is read but texts and evidence.
+
+    Args:
+        path: The output of `diagnose --json` or `--parquet`.
 
     Raises:
         InputError: If the file cannot be read, a line is not a diagnosis, or a run occurs twice.
     """
+    if Path(path).is_dir():
+        return Results(str(path), list(read_diagnoses(path, texts=False)))
     check_memory(JSON_EXPANSION * stored_bytes(Path(path)), str(path), "its lines")
     with reading(path, "results", EXPECTED):
         lines = Path(path).read_text(encoding="utf-8").split("\n")

@@ -37,15 +37,14 @@ from failuretwin.inference.posterior import (
     check_diagnosable,
     shows_in_transients,
 )
-from failuretwin.inference.seen_runs import SeenRuns, common_remarks, mixed
+from failuretwin.inference.prepared import PART_RUNS, PreparedDiagnoser, parts_of, spread
+from failuretwin.inference.seen_runs import SeenRuns
 
 if TYPE_CHECKING:
     import xarray as xr
 
 OF_ENCODERS = ("encoder_bias", "encoder_scale")
 """Faults that make the reading of a motor wrong."""
-CHUNK_RUNS = 64
-"""Runs of five movements at a time: keeps the work on nodes in about 100 MB."""
 
 
 @dataclass(frozen=True, init=False)
@@ -158,27 +157,28 @@ class BayesDiagnoser:
                 to be believed, or no run holds a movement.
         """
         runs = as_runs(runs, self.twin.robot)
-        told = self.seen(runs)
-        set_ups = told.set_ups()
-        seen = [told.under(one.set_up.correction) for one in set_ups.found]
-        moving = [self._moving(one) for one in seen]
-        names, truth = [str(name) for name in runs["run"].values], truths_of(runs)
-        results, quality = [], seen[0].evidence.quality
-        chunk = _runs_at_a_time(seen[0].settled.movements.start.shape[1])
-        for first in range(0, len(names), chunk):
-            rows = slice(first, first + chunk)
-            says = [one.posterior(rows, way) for one, way in zip(seen, moving, strict=True)]
-            rounding = seen[0].rounding()
-            likeliest, common = mixed(says, set_ups, rounding), common_remarks(set_ups, rounding)
-            robots = seen[0].robots(likeliest, common, len(says) == 1 and set_ups.fits)
-            for at in range(len(names))[rows]:
-                posterior, row = robots.of_run(at - first)
-                results.append(posterior.to_diagnosis(row, names[at], quality[at], truth[at]))
-        return results
+        self.check(runs)
+        count = runs.sizes["run"]
+        if count <= PART_RUNS:
+            return self.prepare(runs).diagnose(runs)
+        prepared = self.prepare(runs.isel(run=spread(count)))
+        parts = (runs.isel(run=slice(part.start, part.stop)) for part in parts_of(count))
+        return [diagnosis for part in parts for diagnosis in prepared.diagnose(part)]
+
+    def prepare(self, sample: xr.Dataset) -> PreparedDiagnoser:
+        """Return a diagnoser of a run set whose set-up is judged by some of its runs.
+
+        Args:
+            sample: These runs: those of `spread`, of a set of any size.
+
+        Raises:
+            InputError: As `diagnose` does.
+        """
+        return PreparedDiagnoser(self.seen(sample), self._moving)
 
     def seen(self, runs: xr.Dataset) -> SeenRuns:
         """Return runs as this diagnoser sees them, set up as told; raises as `diagnose` does."""
-        self._check(runs)
+        self.check(runs)
         model = self.healthy_model.seen_by(sensing_of(runs, self.sensing))
         self._check_shown(model)
         found = SeenRuns(runs, model, self.hypothesis_set, self.priors, self.whole_run)
@@ -191,9 +191,10 @@ class BayesDiagnoser:
 
     def _moving(self, seen: SeenRuns) -> TransientSamples | None:
         """Return the readings on the way that count; None: none do."""
-        if not self.uses_transients:
+        sound = seen.evidence.sound
+        if not (self.uses_transients and sound.settled.usable.shape[1]):
             return None
-        moving = beside(seen.evidence.sound.transient, seen.settled)
+        moving = beside(sound.transient, seen.settled)
         return moving.where(self.transient_mask(seen.settled.usable, seen.model.sensors))
 
     def _check_shown(self, model: HealthyModel) -> None:
@@ -205,7 +206,8 @@ class BayesDiagnoser:
                     f"{'+'.join(model.sensing)}). Leave out encoders, or that fault."
                 )
 
-    def _check(self, runs: xr.Dataset) -> None:
+    def check(self, runs: xr.Dataset) -> None:
+        """Raise InputError unless a run set is one of this robot, and holds the known onset."""
         check_runs(runs, "the run set")
         check_motors(runs, self.twin.robot.name, self.twin.robot.motor_names)
         known, end = self.priors.onset.known_s, float(runs["time"].values[-1])
@@ -242,11 +244,6 @@ def diagnose(
     """
     diagnoser = BayesDiagnoser(robot, calibration, hypotheses, priors, sensing=sensing)
     return diagnoser.diagnose(runs)
-
-
-def _runs_at_a_time(movements: int) -> int:
-    """Return how many runs of so many movements to weigh at a time: nodes grow with the square."""
-    return max(1, min(CHUNK_RUNS, 25 * CHUNK_RUNS // max(movements, 1) ** 2))
 
 
 # What every diagnoser offers, and how one of the user's own is found by its name.

@@ -71,6 +71,8 @@ class SeenRuns:
         hypotheses: What may be the case.
         priors: Beliefs about faults and set-ups.
         whole_run: Whether readings on the way count.
+        judges: Runs of the same set, under the same set-up, by which rounding and the place of the
+            sensor are judged; None: these runs.
     """
 
     runs: xr.Dataset
@@ -78,6 +80,7 @@ class SeenRuns:
     hypotheses: Sequence[Hypothesis]
     priors: Priors
     whole_run: bool = True
+    judges: SeenRuns | None = None
 
     @cached_property
     def evidence(self) -> Evidence:
@@ -86,14 +89,16 @@ class SeenRuns:
 
     @cached_property
     def settled(self) -> SettledEvidence:
-        """Where the tool settled after each movement, or was on its way."""
+        """Where the tool settled after each movement, or was on its way; one movement at least."""
         sound = self.evidence.sound
+        if not sound.settled.usable.shape[1]:
+            return sound.settled.padded(1)
         return on_the_way(sound, self.model) if self.whole_run else sound.settled
 
     @cached_property
     def healthy(self) -> HealthyModel:
         """The healthy robot as these runs show it, with what was rounded off as noise."""
-        return rounded(self.model, self.tool_rounding, None)
+        return rounded(self.model, self._judges.tool_rounding, None)
 
     @cached_property
     def tool_rounding(self) -> Rounding | None:
@@ -121,7 +126,8 @@ class SeenRuns:
 
     def rounding(self) -> list[str]:
         """Return what is to be said of how coarsely the runs were written down, a line each."""
-        return told_of(self.tool_rounding, *self.command_rounding)
+        judges = self._judges
+        return told_of(judges.tool_rounding, *judges.command_rounding)
 
     @cached_property
     def sample(self) -> RunLikelihood:
@@ -197,6 +203,14 @@ class SeenRuns:
         """Return the same runs with a wrong set-up undone."""
         return self if correction.is_none else replace(self, runs=correction.runs(self.runs))
 
+    def part(self, runs: xr.Dataset) -> SeenRuns:
+        """Return other runs of the same set, under the same set-up, judged by these."""
+        return replace(self, runs=runs, judges=self)
+
+    @property
+    def _judges(self) -> SeenRuns:
+        return self.judges or self
+
     def posterior(self, rows: slice, moving: TransientSamples | None) -> Posterior:
         """Return what some of the runs say.
 
@@ -207,8 +221,10 @@ class SeenRuns:
         way = None if moving is None else moving[rows]
         some = np.arange(len(self.settled.usable))[rows]
         likelihood = RunLikelihood(self.settled.alike(some), self.healthy, way)
-        known = self.weighed_sample if np.array_equal(some, self.sampled) else ()
-        return run_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt, known)
+        judged = self.judges is None and np.array_equal(some, self.sampled)
+        known = self.weighed_sample if judged else ()
+        in_doubt = self._judges.in_doubt
+        return run_posterior(likelihood, self.hypotheses, self.priors, in_doubt, known)
 
     def robots(self, named: Posterior, common: Sequence[str], others: bool) -> RobotMixture:
         """Return what runs say of the robot: that of the model, or another of its kind.
@@ -218,8 +234,9 @@ class SeenRuns:
             common: What is said of the log of all runs.
             others: Whether other robots are weighed.
         """
-        components = self.components if others else self.components[:1]
-        return RobotMixture.of(named, components, self.priors, self.in_doubt, common)
+        judges = self._judges
+        components = judges.components if others else judges.components[:1]
+        return RobotMixture.of(named, components, self.priors, judges.in_doubt, common)
 
     def elsewhere(self) -> str:
         """Return that the sensor stands elsewhere, or is noisier, if most runs say so."""

@@ -13,6 +13,7 @@ import click
 import failuretwin as ft
 from failuretwin.app.commands import options as opt
 from failuretwin.app.commands.store import StoreOptions, recorded_option, store_options
+from failuretwin.app.commands.workforce import WorkforceOptions, workforce_options
 from failuretwin.app.terminal import progress_bar, show, tell
 from failuretwin.core.errors import InputError, counted
 
@@ -31,12 +32,14 @@ if TYPE_CHECKING:
 @store_options
 @recorded_option
 @opt.reading_options
+@workforce_options("the runs", "the logs")
 @opt.robot_options
 def import_(
     out: Path,
     memory: StoreOptions,
     recorded: datetime | None,
     reading: opt.LogOptions,
+    force: WorkforceOptions,
     robot: opt.RobotOptions,
 ) -> None:
     """Read logs and write them as one run set.
@@ -49,7 +52,7 @@ def import_(
     if out.resolve() in [log.resolve() for log in reading.logs]:
         raise InputError(f"{out}: is what is to be read. Give another name to write to.")
     stored = memory.record(robot)
-    runs = reading.runs(robot.model)
+    runs = reading.runs(robot.model, force.workforce)
     export_runs(runs, out, ft.DigitalTwin(robot.model))
     tell(f"{counted(runs.sizes['run'], 'run')} written to {out}")
     if stored is not None:
@@ -85,18 +88,7 @@ def import_(
     "[drift]. Default: the paper's stuck and steady_state_error; the other modes as assumed in "
     "docs/fault_modes.md.",
 )
-@opt.count_option(
-    "--workers",
-    1,
-    "Processes on this machine to spread the work over; the runs do not depend on it.",
-    least=1,
-)
-@click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    help="Dask scheduler whose workers do the work instead, such as tcp://host:8786. They must "
-    "share the folder of --out.",
-)
+@workforce_options("the runs", "the folder of --out")
 @opt.plugin_option
 @opt.calibrated_robot_options("none")
 def simulate(
@@ -106,8 +98,7 @@ def simulate(
     engine: str,
     sensors: str | None,
     faults: Path | None,
-    workers: int,
-    scheduler: str | None,
+    force: WorkforceOptions,
     robot: opt.RobotOptions,
 ) -> None:
     """Make labelled runs with the digital twin and write them as a run set.
@@ -118,7 +109,6 @@ def simulate(
     from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
     from failuretwin.data_knowledge.resumable import produce
     from failuretwin.data_knowledge.store import check_destination
-    from failuretwin.data_knowledge.workers import Workforce
     from failuretwin.failure_behavior.registry import MODES, load_modes
 
     check_destination(out)
@@ -136,7 +126,7 @@ def simulate(
         sensors=[] if sensors is None else [kind.strip() for kind in sensors.split(",")],
         modes=MODES if faults is None else load_modes(faults),
     )
-    workforce = Workforce(workers, scheduler)
+    workforce = force.workforce
     with progress_bar("simulating", plan.size) as advance:
         produce(plan, out, workforce, advance, tell=lambda text: tell(text, err=True))
     tell(f"{counted(plan.size, 'run')} written to {out}")

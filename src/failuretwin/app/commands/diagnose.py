@@ -20,10 +20,13 @@ from failuretwin.app.commands.store import (
     recorded_option,
     store_options,
 )
+from failuretwin.app.commands.workforce import WorkforceOptions, workforce_options
 from failuretwin.app.terminal import show, tell
 from failuretwin.core.errors import InputError
 
 if TYPE_CHECKING:
+    from failuretwin.app.remembering import RobotRecord
+    from failuretwin.data_knowledge.workers import Workforce
     from failuretwin.inference.together.fault_course import FaultCourse
 
 BAYES_ONLY = (
@@ -33,6 +36,11 @@ BAYES_ONLY = (
 """Options that only the Bayesian diagnosis has."""
 LEARNING = ("out", "independent")
 """Options that only learning from several runs has."""
+WHOLE = (
+    *("method", "track", "self_calibrate", "out", "independent", "learned_priors"),
+    *("json_file", "csv_file", "report", "correct"),
+)
+"""Options that need all runs in memory."""
 
 
 @click.command()
@@ -92,6 +100,12 @@ LEARNING = ("out", "independent")
 )
 @opt.json_option("Write one object a run, one a line.")
 @opt.file_option("--csv csv_file", "FILE", "Write a table, a row a run.")
+@opt.file_option(
+    "--parquet",
+    "DIR",
+    "Write a folder of parquet files, piece by piece: for more runs than memory holds. The same "
+    "command goes on after an interruption. Prints a summary in place of a row a run.",
+)
 @opt.report_option(
     "Write index.html: the state of the robot, what to do, and pictures of some runs."
 )
@@ -107,6 +121,7 @@ LEARNING = ("out", "independent")
 @learned_priors_option
 @recorded_option
 @opt.reading_options
+@workforce_options("results", "the logs and the folder of --parquet")
 @opt.plugin_option
 @opt.calibrated_robot_options()
 def diagnose(
@@ -122,12 +137,14 @@ def diagnose(
     sensing: str | None,
     json_file: Path | None,
     csv_file: Path | None,
+    parquet: Path | None,
     report: Path | None,
     correct: Path | None,
     learned_priors: bool,
     recorded: datetime | None,
     memory: StoreOptions,
     reading: opt.LogOptions,
+    force: WorkforceOptions,
     robot: opt.RobotOptions,
 ) -> None:
     """Diagnose runs from commands and tool path alone, or what other sensors saw (--sensing).
@@ -148,7 +165,6 @@ def diagnose(
     offsets.check_correctable(reading.logs, correct)
     together = track or self_calibrate
     stored, known = memory.look_up(robot, learned_priors and not together)
-    keeper = None if stored is None else stored.keeper(reading, recorded)
     bayes = ft.BayesDiagnoser(
         known.twin,
         imperfections=known.imperfections,
@@ -156,13 +172,17 @@ def diagnose(
         priors=priors_of(known.robot, sse_range, onset, error_range),
         sensing=sensing,
     )
+    if parquet is not None:
+        _diagnose_many(reading, bayes, parquet, force.workforce, stored, recorded)
+        return
+    keeper = None if stored is None else stored.keeper(reading, recorded)
     if learned_priors:
         bayes = memory.needed(stored, LEARNED).with_learned_priors(bayes)
     _refuse_unused(method == given.BAYES, track, self_calibrate)
     diagnoser = given.chosen_diagnoser(method, bayes)
     start = learning.Start(robot.calibration, out, stored)
     tracking = learning.Tracking(bayes, start) if track else None
-    runs = reading.runs(known.robot) if keeper is None else keeper.runs(known.robot)
+    runs = (reading if keeper is None else keeper).runs(known.robot, force.workforce)
     sensed = sensing_of(runs, sensing)
     given.warn_mismatch(runs, given.expected_name(diagnoser))
     if together:
@@ -190,6 +210,32 @@ def diagnose(
     show(*([""] if last else []), *last)
     show(*offsets.offset_lines(runs, known, diagnoses, reading, correct))
     show(*remembered)
+
+
+def _diagnose_many(
+    reading: opt.LogOptions,
+    bayes: ft.BayesDiagnoser,
+    parquet: Path,
+    workforce: Workforce,
+    stored: RobotRecord | None,
+    recorded: datetime | None,
+) -> None:
+    """Diagnose runs of any number into parquet files, and store the diagnoses if there is a store.
+
+    Raises:
+        InputError: If an option needs all runs in memory.
+    """
+    from failuretwin.app.many_runs import diagnose_many, remember_many
+
+    opt.refuse_unused("--parquet holds a piece of the runs in memory, not all", *WHOLE)
+    if stored is not None and len(reading.logs) > 1:
+        raise InputError(
+            f"--parquet and --store take one LOG, got {len(reading.logs)}. Diagnose one after the "
+            "other."
+        )
+    show(*diagnose_many(reading, bayes, parquet, workforce))
+    if stored is not None:
+        tell(remember_many(stored, parquet, reading, recorded))
 
 
 def _by_learned_priors(diagnoses: Sequence[ft.Diagnosis]) -> list[ft.Diagnosis]:

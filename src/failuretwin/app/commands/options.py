@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from failuretwin.data_knowledge.readers.raw_sessions import As
+    from failuretwin.data_knowledge.workers import Workforce
     from failuretwin.decision.acting.safety import SafetyGate
     from failuretwin.decision.test_motions.probing import ProbeRules
     from failuretwin.digital_model.calibrated_robot import CalibratedRobot
@@ -234,17 +235,21 @@ class LogOptions:
     columns: Path | None
     approximate: bool
 
-    def runs(self, robot: ft.Robot) -> xr.Dataset:
-        """Return the runs of all logs as one run set."""
+    @property
+    def options(self) -> ft.ReadOptions:
+        """How logs become runs, but for the map of columns."""
+        how = cast("As", self.how)
+        return ft.ReadOptions(how, self.published_labels, approximate=self.approximate)
+
+    def runs(self, robot: ft.Robot, workforce: Workforce | None = None) -> xr.Dataset:
+        """Return the runs of all logs as one run set; None: this process reads them."""
         from failuretwin.app.inputs import read_inputs
 
-        how = cast("As", self.how)
-        options = ft.ReadOptions(how, self.published_labels, approximate=self.approximate)
-        return read_inputs(self.logs, robot, options, self.columns)
+        return read_inputs(self.logs, robot, self.options, self.columns, workforce)
 
-    def parts(self, robot: ft.Robot) -> list[xr.Dataset]:
+    def parts(self, robot: ft.Robot, workforce: Workforce | None = None) -> list[xr.Dataset]:
         """Return the runs of each log as a run set of its own."""
-        return [replace(self, logs=(log,)).runs(robot) for log in self.logs]
+        return [replace(self, logs=(log,)).runs(robot, workforce) for log in self.logs]
 
 
 reading_options = gathered(

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("results", type=opt.PATH, metavar="RESULTS.jsonl")
+@click.argument("results", type=opt.PATH, metavar="RESULTS.jsonl|DIR")
 @opt.file_option(
     "--truth",
     "RUNS",
@@ -50,11 +50,12 @@ def evaluate(
     report: Path | None,
     robot: opt.RobotOptions,
 ) -> None:
-    """Score the results of `diagnose --json` against the truth."""
+    """Score the results of `diagnose --json` or `--parquet` against the truth."""
     import numpy as np
 
     from failuretwin.app.reports.plots import write_reliability
     from failuretwin.app.reports.reports import comparison_parts, evaluation_parts, write_latex
+    from failuretwin.data_knowledge.run_pieces import open_runs
     from failuretwin.decision.evaluation import Truths
 
     truths = None
@@ -62,7 +63,7 @@ def evaluate(
         opt.refuse_unused("no runs with the truth are given", "published_labels")
     else:
         options = ft.ReadOptions(published_labels=published_labels)
-        truths = Truths.of(ft.read_runs(truth, robot.robot, options), str(truth))
+        truths = Truths.of(open_runs(truth, robot.model, options), str(truth))
     first = ft.read_results(results)
     scores = ft.evaluate(first, truths, np.random.default_rng(robot.seed))
     comparison = None

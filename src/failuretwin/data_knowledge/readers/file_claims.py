@@ -32,8 +32,13 @@ TEXT_CELL_BYTES = 64
 # NetCDF: HDF5 with conventions.
 
 
-def check_netcdf(path: Path) -> None:
-    """Raise InputError unless the arrays of a NetCDF file can be meant and lie in it alone."""
+def check_netcdf(path: Path, most_runs: int | None = None) -> None:
+    """Raise InputError unless the arrays of a NetCDF file can be meant and lie in it alone.
+
+    Args:
+        path: The file.
+        most_runs: The most runs that are in memory at a time; None: all.
+    """
     import h5py
 
     found: list[float] = []
@@ -43,7 +48,8 @@ def check_netcdf(path: Path) -> None:
             if item.external or item.is_virtual:
                 raise _elsewhere(path, name)
             cell = TEXT_CELL_BYTES if h5py.check_string_dtype(item.dtype) else item.dtype.itemsize
-            largest = max(math.prod(item.shape or ()), math.prod(item.chunks or ()))
+            shape = _at_a_time(item.shape or (), most_runs)
+            largest = max(math.prod(shape), math.prod(item.chunks or ()))
             found.append(float(largest) * cell)
 
     with h5py.File(path, "r") as file:
@@ -52,6 +58,11 @@ def check_netcdf(path: Path) -> None:
                 raise _elsewhere(path, name)
         file.visititems(weigh)
     check_size(sum(found), path, "its arrays")
+
+
+def _at_a_time(shape: tuple[int, ...], most_runs: int | None) -> tuple[int, ...]:
+    """Return the shape of what is in memory at a time; the first axis is that of the runs."""
+    return shape if most_runs is None or not shape else (min(shape[0], most_runs), *shape[1:])
 
 
 def _elsewhere(path: Path, name: str) -> InputError:
@@ -67,8 +78,13 @@ MAY_BE_EMPTY = ("onset", "magnitude", "position", "temperature", "voltage")
 """Variables that may be unknown throughout; other writers leave out chunks that are all unknown."""
 
 
-def check_zarr(path: Path) -> None:
-    """Raise InputError unless a Zarr store has only known codecs, sane sizes and all its chunks."""
+def check_zarr(path: Path, most_runs: int | None = None) -> None:
+    """Raise InputError unless a Zarr store has only known codecs, sane sizes and all its chunks.
+
+    Args:
+        path: The store.
+        most_runs: The most runs that are in memory at a time; None: all.
+    """
     import zarr
 
     total = 0.0
@@ -80,7 +96,8 @@ def check_zarr(path: Path) -> None:
         if node.get("node_type") == "array":
             array = zarr.open_array(file.parent, mode="r", zarr_format=ZARR_FORMAT)
             cell = array.dtype.itemsize if array.dtype.kind in "biufU" else TEXT_CELL_BYTES
-            total += float(max(math.prod(array.shape), math.prod(array.chunks))) * cell
+            shape = _at_a_time(array.shape, most_runs)
+            total += float(max(math.prod(shape), math.prod(array.chunks))) * cell
             check_size(total, path, "its arrays")
             _check_chunks(array, file.parent)
     if any((path / name).exists() for name in (".zgroup", ".zarray", ".zmetadata")):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, cast
@@ -40,6 +41,7 @@ from failuretwin.data_knowledge.readers.raw_sessions import (
 from failuretwin.data_knowledge.readers.rtde import is_rtde, read_rtde
 from failuretwin.data_knowledge.readers.timed_log import TimedLog, timed_run
 from failuretwin.data_knowledge.store import SUFFIXES, load_run_set
+from failuretwin.data_knowledge.workers import ONE_PROCESS, Workforce
 from failuretwin.digital_model.robot import Robot, load_robot
 
 if TYPE_CHECKING:
@@ -90,6 +92,7 @@ def read_runs(
     sources: str | Path | Sequence[str | Path],
     robot: Robot | str = "armpi_fpv",
     options: ReadOptions | None = None,
+    workforce: Workforce = ONE_PROCESS,
 ) -> xr.Dataset:
     """Read runs from anything that holds some, as one run set.
 
@@ -100,6 +103,7 @@ def read_runs(
             by their names or named by a column map.
         robot: The robot that the logs are of, or its name.
         options: How logs become runs.
+        workforce: Processes that read the logs, each log once; the runs do not depend on them.
 
     Raises:
         InputError: If a source does not exist, cannot be read or holds no runs.
@@ -109,7 +113,34 @@ def read_runs(
     if isinstance(sources, str | Path):
         sources = [sources]
     options = options or ReadOptions()
-    parts = [part for source in sources for part in _read_source(Path(source), robot, options)]
+    logs = find_logs([Path(source) for source in sources], options)
+    return read_logs(logs, robot, options, workforce)
+
+
+def read_logs(
+    logs: Sequence[Log],
+    robot: Robot,
+    options: ReadOptions,
+    workforce: Workforce = ONE_PROCESS,
+    on_progress: Callable[[int], None] = lambda logs: None,
+) -> xr.Dataset:
+    """Return the runs of some logs as one run set.
+
+    Args:
+        logs: The logs, from `find_logs`.
+        robot: The robot that they are of.
+        options: How logs become runs.
+        workforce: Processes that read them, each log once; the runs do not depend on them.
+        on_progress: Called with the number of further logs that have been read.
+
+    Raises:
+        InputError: If a log cannot be read.
+    """
+    parts: list[xr.Dataset] = []
+    with workforce.map(partial(read_log, robot=robot, options=options), logs) as found:
+        for some in found:
+            parts += some
+            on_progress(1)
     runs = concatenate(parts)
     worst = max(parts, key=lambda part: float(part.attrs.get(RECOVERY_ERROR, -1.0)))
     if RECOVERY_ERROR in worst.attrs:  # the worst of several files is reported
@@ -137,20 +168,75 @@ class Reader:
     read: Callable[[Path, Robot, ReadOptions], list[xr.Dataset]]
 
 
-def _read_source(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+@dataclass(frozen=True)
+class Log:
+    """The least that is read by itself: a file, a session folder, a data set.
+
+    Attributes:
+        path: Where it is.
+        read: Returns the run sets in it.
+    """
+
+    path: Path
+    read: Callable[[Path, Robot, ReadOptions], list[xr.Dataset]]
+
+    @property
+    def is_run_set(self) -> bool:
+        """Whether it is a stored run set, of which some runs can be read."""
+        return self.read is _read_run_set
+
+
+def read_log(log: Log, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+    """Return the run sets in a log; raises as `read_runs` does."""
+    return log.read(log.path, robot, options)
+
+
+def find_logs(sources: Sequence[Path], options: ReadOptions) -> list[Log]:
+    """Return the logs in some sources; folders are searched downwards.
+
+    Raises:
+        InputError: If a source does not exist or is of no kind that can be read.
+    """
+    return [log for source in sources for log in _logs_in(source, options)]
+
+
+def _logs_in(path: Path, options: ReadOptions) -> list[Log]:
     if not path.exists():
         raise InputError(f"{path}: does not exist. Expected a run set, a log or a folder of logs.")
     if not (path.is_file() or path.is_dir()):
         raise InputError(f"{path}: is a device or a pipe. Expected a file or a folder of logs.")
     for reader in READERS:
         if reader.recognises(path):
-            return reader.read(path, robot, options)
+            return [Log(path, reader.read)]
+    if path.is_dir():
+        return _logs_below(path, options)
     raise InputError(
         f"{path}: not a kind of file that can be read. Expected a run set (.nc, .zarr), a "
         "published MATLAB file (.mat), a bag (.bag, .mcap), a CSV file, an RTDE recording, a "
         f"LeRobot data set (a folder with {INFO_FILE}), or a folder that holds "
         f"{', '.join(SESSION_FILES)}."
     )
+
+
+def _logs_below(path: Path, options: ReadOptions) -> list[Log]:
+    found = [Log(folder, _read_session) for folder in find_sessions(path)]
+    found += [Log(file, _read_matlab) for file in find_matlab_files(path)]
+    infos = sorted(files_below(path, INFO_FILE.name))
+    sets = [file.parents[1] for file in infos if file.parent.name == INFO_FILE.parent.name]
+    found += [Log(folder, _read_lerobot) for folder in sets]
+    if not found and options.columns is not None:
+        found = [Log(file, _read_csv) for file in sorted(files_below(path, "*.csv"))]
+    if not found:
+        raise InputError(
+            f"{path}: no raw session in it or below, no published MATLAB file and no LeRobot data "
+            f"set. A session is a folder that holds {', '.join(SESSION_FILES)}. Name other files "
+            "one by one, or all CSV files with --columns."
+        )
+    return found
+
+
+def _read_run_set(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+    return [load_run_set(path)]
 
 
 def _read_bag(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
@@ -160,23 +246,6 @@ def _read_bag(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset
 def _read_lerobot(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
     found = read_lerobot(path, robot, options.lerobot)
     return _log_datasets(found.logs, robot, found.source)
-
-
-def _read_folder(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
-    found = [_read_session(folder, robot, options) for folder in find_sessions(path)]
-    found += [_read_matlab(file, robot, options) for file in find_matlab_files(path)]
-    infos = sorted(files_below(path, INFO_FILE.name))
-    sets = [file.parents[1] for file in infos if file.parent.name == INFO_FILE.parent.name]
-    found += [_read_lerobot(folder, robot, options) for folder in sets]
-    if not found and options.columns is not None:
-        found = [_read_csv(file, robot, options) for file in sorted(files_below(path, "*.csv"))]
-    if not found:
-        raise InputError(
-            f"{path}: no raw session in it or below, no published MATLAB file and no LeRobot data "
-            f"set. A session is a folder that holds {', '.join(SESSION_FILES)}. Name other files "
-            "one by one, or all CSV files with --columns."
-        )
-    return [part for parts in found for part in parts]
 
 
 def _read_session(folder: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
@@ -203,12 +272,11 @@ def _read_csv(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset
 
 
 READERS = (
-    Reader(lambda path: path.suffix in SUFFIXES, lambda path, *_: [load_run_set(path)]),
+    Reader(lambda path: path.suffix in SUFFIXES, _read_run_set),
     Reader(is_bag, _read_bag),
     Reader(is_lerobot, _read_lerobot),
-    Reader(Path.is_dir, _read_folder),
-    Reader(lambda path: path.suffix == ".mat", _read_matlab),
-    Reader(lambda path: path.suffix == ".csv" or is_rtde(path), _read_csv),
+    Reader(lambda path: path.suffix == ".mat" and not path.is_dir(), _read_matlab),
+    Reader(lambda path: not path.is_dir() and (path.suffix == ".csv" or is_rtde(path)), _read_csv),
 )
 """Readers of all kinds of logs; the first one that recognises a path reads it."""
 

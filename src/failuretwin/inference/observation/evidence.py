@@ -209,6 +209,13 @@ class SettledEvidence(ArrayStruct):
             return replace(some, movements=some.movements.as_movements)
         return some
 
+    def padded(self, movements: int) -> SettledEvidence:
+        """Return these runs with room for so many movements at least."""
+        runs, here = self.usable.shape
+        wide = self.blank(runs, max(here, movements))
+        wide.put((slice(None), slice(0, here)), self)
+        return wide
+
     def followed_by(self, evidence: SettledEvidence) -> SettledEvidence:
         """Return these runs with others behind them; shorter ones are padded."""
         (runs, here), (new, there) = self.usable.shape, evidence.usable.shape

@@ -115,13 +115,15 @@ def folder_posterior(
         asked = None if last else healthy if as_healthy else likely
         noise = COARSE * likelihood.model.twin.robot.reach if done == 0 else 0.0
         found = together.judge(rows, asked=asked, noise_m=noise)
-        advance(int(done < PASSES))
         if last:
+            posteriors = [_posterior(each, together.here, usual) for each in found]
+            advance(int(done < PASSES))
             break
         before = together.here
-        if done >= OPEN:
-            likely = np.concatenate([each.likely for each in found])
-        together.learn(found, 1.0 if done == 0 else DAMPING, float(done > AS_HEALTHY))
+        damping = 1.0 if done == 0 else DAMPING
+        probable = together.learn(found, damping, float(done > AS_HEALTHY))
+        likely = probable if done >= OPEN else None
+        advance(int(done < PASSES))
         (_,), (covariance,) = together.belief.moments
         spread = together.unit * np.sqrt(np.diag(covariance))
         moved = float(np.abs((together.here - before) / spread).max())
@@ -131,7 +133,6 @@ def folder_posterior(
     mean, covariance = mean * unit, covariance * np.outer(unit, unit)
     place = mean.copy()
     place[REGISTRATION:] = 0.0
-    posteriors = [_posterior(each, together.here, usual) for each in found]
     at = together.at(mean)
     return FolderPosterior(at, place, mean, covariance, unit, usual, sites, taught, posteriors)
 

@@ -16,7 +16,7 @@ Section: docs/inference.md#folders
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -156,8 +156,10 @@ class RunsTogether:
         moving: TransientSamples | None = None,
         asked: BoolArray | None = None,
         noise_m: float = 0.0,
-    ) -> list[Judged]:
-        """Return what some runs say, each with its cavity; so many at a time as fit.
+    ) -> Iterator[Judged]:
+        """Yield what some runs say, each with its cavity; so many at a time as fit.
+
+        Nothing may be learned before the last one was taken.
 
         Args:
             rows: The runs.
@@ -165,36 +167,42 @@ class RunsTogether:
             asked: Hypotheses that are weighed, (of these runs, hypothesis); None: all.
             noise_m: Noise of the sensor beside what is known [m].
         """
-        return [
-            self._judge(
-                rows[p],
-                None if moving is None else moving[p],
-                None if asked is None else asked[p],
-                noise_m,
-            )
-            for p in np.split(np.arange(len(rows)), np.arange(CHUNK_RUNS, len(rows), CHUNK_RUNS))
-        ]
+        parts = np.split(np.arange(len(rows)), np.arange(CHUNK_RUNS, len(rows), CHUNK_RUNS))
+        for p in parts:
+            way = None if moving is None else moving[p]
+            yield self._judge(rows[p], way, None if asked is None else asked[p], noise_m)
 
-    def learn(self, found: Sequence[Judged], damping: float = 1.0, of_habits: float = 1.0) -> None:
+    def learn(
+        self, found: Iterable[Judged], damping: float = 1.0, of_habits: float = 1.0
+    ) -> BoolArray:
         """Take in what runs say: sites, scatter, rates.
+
+        What was worked out to judge them is dropped as soon as a site is there.
 
         Args:
             found: What they say.
             damping: Share of a new site that is taken.
             of_habits: Share of what they newly say of scatter and losses that is taken.
+
+        Returns:
+            Which hypotheses of each run may teach something, (run, hypothesis).
         """
-        for judged in found:
-            rows = judged.rows
-            site = self._site(judged)
+        said = [self._said(judged) for judged in found]
+        for rows, site, told, _ in said:
             old = Normal(self.sites.precision[rows], self.sites.shift[rows])
             self.sites.precision[rows] += damping * (site.precision - old.precision)
             self.sites.shift[rows] += damping * (site.shift - old.shift)
-            if self.habits is not None:
-                told = judged.habits(self.given.model)
+            if told is not None:
                 self.told.put(rows, self.told[rows].toward(told, of_habits))
-        self._wait_for_scales(np.concatenate([judged.rows for judged in found]))
+        self._wait_for_scales(np.concatenate([rows for rows, *_ in said]))
         self.maximise()
         self.here = self.layout.place(self.belief.moments[0][0] * self.unit)
+        return np.concatenate([likely for *_, likely in said])
+
+    def _said(self, judged: Judged) -> tuple[IntArray, Normal, Habits | None, BoolArray]:
+        """Return runs, their sites, what they say of habits, and their likely hypotheses."""
+        habits = None if self.habits is None else judged.habits(self.given.model)
+        return judged.rows, self._site(judged), habits, judged.likely
 
     def _wait_for_scales(self, rows: IntArray) -> None:
         """Let what some runs say of tails wait until scatter and noise are found."""

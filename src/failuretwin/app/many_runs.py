@@ -1,0 +1,92 @@
+"""`diagnose --parquet`: more runs than memory holds."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from failuretwin.app.inputs import with_map
+from failuretwin.app.reports.reports import score_parts
+from failuretwin.app.terminal import Part, figures_table, progress_bar, tell
+from failuretwin.core.errors import counted
+from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, OPEN_STATE
+from failuretwin.data_knowledge.run_pieces import PIECE, RunPieces
+from failuretwin.data_knowledge.workers import Workforce
+from failuretwin.decision.chunked_diagnosis import diagnose_to_parquet
+from failuretwin.decision.evaluation import Judged
+from failuretwin.decision.parquet_results import read_diagnoses
+from failuretwin.decision.scoring import NO_VERDICT
+from failuretwin.inference.diagnoser import BayesDiagnoser
+
+if TYPE_CHECKING:
+    from datetime import datetime
+
+    from failuretwin.app.commands.options import LogOptions
+    from failuretwin.app.remembering import RobotRecord
+
+STATES = (HEALTHY_STATE, FAULTY_STATE, OPEN_STATE)
+
+
+def diagnose_many(
+    reading: LogOptions, bayes: BayesDiagnoser, folder: Path, workforce: Workforce
+) -> list[Part]:
+    """Diagnose runs of any number into a folder of parquet files, and return a summary.
+
+    Raises:
+        InputError: If runs cannot be read, or the workforce cannot be had.
+        OutputError: If the results cannot be written.
+    """
+    robot = bayes.twin.robot
+    options, correction = with_map(reading.options, reading.columns, reading.logs, robot)
+    runs = RunPieces(reading.logs, robot, options)
+    with progress_bar("diagnosing", sum(piece.size for piece in runs.pieces)) as advance:
+        diagnose_to_parquet(
+            runs,
+            bayes,
+            folder,
+            correction,
+            workforce.workers,
+            workforce.scheduler,
+            advance,
+            tell=lambda text: tell(text, err=True),
+        )
+    return _summary(folder)
+
+
+def remember_many(
+    stored: RobotRecord, folder: Path, reading: LogOptions, recorded: datetime | None
+) -> str:
+    """Store the diagnoses in a folder of results piece by piece, and return a line.
+
+    Raises:
+        OutputError: If they cannot be stored.
+    """
+    from failuretwin.data_knowledge.records.log_files import log_file  # needs the extra `store`
+
+    log = log_file(reading.logs[0], recorded)
+    added, known, rest = 0, 0, read_diagnoses(folder)
+    while some := list(islice(rest, PIECE)):
+        done = stored.remember(some, log)
+        added, known = added + done.added, known + done.known
+    before = f", {known} known before" if known else ""
+    return f"remembered in {stored.store.name}: {counted(added, 'run')} of {stored.name}{before}"
+
+
+def _summary(folder: Path) -> list[Part]:
+    """Return how many runs have each diagnosis, and scores where the truth is known."""
+    diagnoses = list(read_diagnoses(folder, texts=False))
+    found = Counter((d.diagnosis or NO_VERDICT, d.state) for d in diagnoses)
+    names = sorted({name for name, _ in found}, key=lambda name: -_total(found, name))
+    rows = [
+        (name, str(_total(found, name)), *(str(found[name, state]) for state in STATES))
+        for name in names
+    ]
+    table = figures_table(("most probable", "runs", *STATES), rows)
+    count = counted(len(diagnoses), "run")
+    return [table, f"\n{count} diagnosed: {folder}", *score_parts(Judged.of(diagnoses))]
+
+
+def _total(found: Counter[tuple[str, str]], name: str) -> int:
+    return sum(found[name, state] for state in STATES)
