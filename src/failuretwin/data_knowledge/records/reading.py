@@ -7,6 +7,7 @@ from pathlib import Path
 import sqlalchemy as sa
 
 from failuretwin.data_knowledge.records import CHECK_DAYS, writing
+from failuretwin.data_knowledge.records.asset_shell import export_shell
 from failuretwin.data_knowledge.records.beliefs import (
     BeliefLine,
     StoredBelief,
@@ -104,6 +105,20 @@ class StoreReader:
         """
         with self._database.reading() as connection:
             return export_parquet(connection, Path(folder))
+
+    def export_shell(self, robot: str, file: str | Path) -> list[str]:
+        """Write a robot as an Asset Administration Shell, and return the names of its submodels.
+
+        Args:
+            robot: Name of the robot.
+            file: The file, ``.aasx`` or ``.json``.
+
+        Raises:
+            InputError: If the store does not know the robot, the SDK is missing, or the suffix is
+                another.
+            OutputError: If it cannot be written; the file is as before.
+        """
+        return export_shell(self.history(robot), Path(file))
 
     def check(self) -> StoreCheck:
         """Check the database, and whether each log is where it was and as it was."""
