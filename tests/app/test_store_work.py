@@ -98,6 +98,22 @@ def test_work_of_every_command_is_in_the_history(run, store, place, calibrated, 
     assert store.check().problems == ()
 
 
+def test_a_fault_that_act_finds_begins_an_episode_and_a_short_task_clears_none(run, file, tmp_path):
+    store = ft.open_store(file, create=True)
+    targets = ("-0.064,0.160,0.168", "0.146,-0.122,0.212", "0.022,-0.181,0.208")
+    (tmp_path / "task.csv").write_text("\n".join(("x,y,z", *targets)))
+    words = ("act", "task.csv", "--store", file, *NAME)
+    told = run(*words, "--fault", "motor_3:stuck=-0.4")
+    (episode,) = store.history("arm_7").episodes
+    assert (episode.motor, episode.mode, episode.state) == ("motor_3", "stuck", "raised")
+    assert "episode 1: motor_3 stuck, raised, since" in told.stdout
+    alarms = [text for text in texts(store.history("arm_7"), "act") if text.startswith("ALARM")]
+    assert alarms
+    assert all("motor 3 stuck at -2" in text for text in alarms)
+    assert "episode" not in run(*words).stdout
+    assert [one.state for one in store.history("arm_7").episodes] == ["raised"]
+
+
 def test_a_check_that_was_recorded_is_stored_with_its_log(run, store, place):
     log = ("--log", ft.sample_log(), "--store", place.url, *NAME)
     told = run("check", *log, "--recorded", "2026-03-02")

@@ -152,6 +152,23 @@ def test_work_is_a_session_without_diagnoses(store, place):
     assert store.history("arm_7").health == "no open fault"
 
 
+def test_alarms_of_work_that_is_over_begin_and_clear_episodes(store):
+    """As `act` stores them: all notes at once."""
+    unsure = Note(at(1), "ALARM", diagnosis("act", "motor_1:stuck", 0.9), "motor_1:stuck", False)
+    over, again = Note(at(2), "CLEARED", HEALTHY, ""), Note(at(3), "ALARM", STUCK, "motor_1:stuck")
+    log = LogFile("act", None, 0, at(0))
+    session = store.begin("arm_7", Basis("act"), unsure, over, again, log=log, runs=["act"])
+    found = store.history("arm_7")
+    assert [(one.state, one.raised) for one in found.episodes] == [
+        ("cleared", False),
+        ("raised", True),
+    ]
+    assert session.changed == found.episodes
+    (over,) = session.note(Note(at(4), "CLEARED", HEALTHY, ""))
+    assert (over.number, over.state) == (2, "cleared")
+    assert found.counts == {}
+
+
 def test_registered_runs_are_not_known_before_they_are_diagnosed(store, place):
     """Their first diagnosis begins episodes as that of any run."""
     log = LogFile("/out.nc", "f00", 9, at(0))

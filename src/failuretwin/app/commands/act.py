@@ -76,7 +76,7 @@ def act(
         commander = commander_of(arm, known, robot.seed, stack)
         if is_moved(arm):
             with noting(stored, "act", known, strategy) as say:
-                results = acting.work(wanted, commander, say)
+                results = acting.work(wanted, commander, say, say.note)
                 say.note(*map(target_line, results))
         else:
             tell("nothing moves without --move; this is what would be ordered")

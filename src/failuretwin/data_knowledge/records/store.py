@@ -43,7 +43,7 @@ from failuretwin.data_knowledge.records.offsets import MotorOffset, add_offsets
 from failuretwin.data_knowledge.records.reading import StoreReader
 from failuretwin.data_knowledge.records.rows import Basis, SessionRows, add_rows
 from failuretwin.data_knowledge.records.schema import repairs
-from failuretwin.data_knowledge.records.sessions import Note, Session, add_notes
+from failuretwin.data_knowledge.records.sessions import Note, Session, follow_notes
 from failuretwin.data_knowledge.records.statements import (
     add_finding,
     replace_calibration,
@@ -161,8 +161,8 @@ class Store(StoreReader):
         Args:
             robot: Name of the robot, made if it is new.
             basis: The command, and what its results rest on.
-            happened: First notes.
-            log: The log, by path and checksum; None: there is none.
+            happened: First notes; episodes follow their diagnoses.
+            log: The log, by path and checksum; None: there is none, nor a diagnosis.
             runs: Names of its runs; diagnoses of the session belong to the first.
             profile: The robot's profile, stored if it is new.
 
@@ -178,8 +178,8 @@ class Store(StoreReader):
                 known, _ = writing.keep_runs(connection, at, runs, [None] * len(runs))
             session = writing.add_session(connection, row, basis)
             of = SessionRows(session, row, known[0] if known else None)
-            add_notes(connection, of, happened)
-        return Session(self._database, of)
+            first = follow_notes(connection, of, happened)
+        return Session(self._database, of, first)
 
     def keep_belief(
         self,
