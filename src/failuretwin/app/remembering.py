@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from failuretwin.app.records import episode_line
 from failuretwin.app.terminal import tell
 from failuretwin.connection.calibration.result import Calibration, calibration_text
-from failuretwin.core.errors import counted
+from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import concatenate
 from failuretwin.data_knowledge.records.episodes import RAISED
@@ -94,6 +94,20 @@ class RobotRecord:
             command=command,
             offsets=offsets,
         )
+
+    def tracked_rows(self) -> tuple[dict[str, Any], ...]:
+        """Return what `diagnose --track` keeps of each run, the oldest first.
+
+        Raises:
+            InputError: If it has followed no run of the robot.
+        """
+        rows = self.store.tracked_rows(self.name)
+        if not rows:
+            raise InputError(
+                f"{self.store.name}: holds no tracked run of {self.name!r}. Expected what "
+                "`diagnose --track` with a store keeps."
+            )
+        return rows
 
     def fault_factors(self, hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
         """Return how many times as probable faults are as by the table, and say why.

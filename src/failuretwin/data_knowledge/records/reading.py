@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import sqlalchemy as sa
 
@@ -11,6 +12,7 @@ from failuretwin.data_knowledge.records.asset_shell import export_shell
 from failuretwin.data_knowledge.records.beliefs import (
     BeliefLine,
     StoredBelief,
+    latest_rows,
     other_line,
     read_belief,
 )
@@ -59,6 +61,15 @@ class StoreReader:
                 return None, ""
             found = read_belief(connection, row, line)
             return found, "" if found else other_line(connection, row, line)
+
+    def tracked_rows(self, robot: str, follower: str = "diagnose") -> tuple[dict[str, Any], ...]:
+        """Return what is kept of each run of a followed robot, the oldest first.
+
+        The runs are those of the line of beliefs that was followed last; empty: there is none.
+        """
+        with self._database.reading() as connection:
+            row = _row_of(connection, robot)
+            return () if row is None else latest_rows(connection, row, follower)
 
     def robots(self) -> list[str]:
         """Return the names of all robots, sorted."""

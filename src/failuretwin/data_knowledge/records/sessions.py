@@ -20,7 +20,7 @@ from failuretwin.data_knowledge.records.episodes import (
 )
 from failuretwin.data_knowledge.records.history import FaultEpisode, read_episodes
 from failuretwin.data_knowledge.records.rows import SessionRows, add_rows
-from failuretwin.data_knowledge.records.schema import notes
+from failuretwin.data_knowledge.records.schema import episodes, notes
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,8 @@ def follow_notes(
             alarmed = _follow_note(tracker, one, number, alarmed)
     _add_notes(connection, rows, happened, behind)
     changed = writing.keep_episodes(connection, rows.robot, tracker.changed, behind)
-    known = read_episodes(connection, rows.robot) if changed else ()
-    return Followed(tuple(one for one in known if one.row in changed), alarmed)
+    known = read_episodes(connection, rows.robot, episodes.c.id.in_(changed)) if changed else ()
+    return Followed(known, alarmed)
 
 
 def _follow_note(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+from failuretwin.connection.life_history import read_rows
 from failuretwin.connection.links.base import Commander
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray
@@ -160,5 +161,6 @@ def act(
     gate = SafetyGate(known.robot, limits or SafetyLimits())
     acting = Acting(known, gate, strategy, ActingSettings())
     if history is not None:
-        acting = replace(acting, spared=wear_weights(Path(history), acting.model))
+        rows = read_rows(Path(history), known.robot.name)
+        acting = replace(acting, spared=wear_weights(rows, acting.model))
     return acting.work(task, commander, tell)
