@@ -76,15 +76,15 @@ def read_belief(connection: sa.Connection, robot: int, line: BeliefLine) -> Stor
     Raises:
         InputError: If it is damaged.
     """
-    last = sa.select(beliefs).join(sessions).where(_of(robot, line))
+    last = sa.select(beliefs).join(sessions).where(_of(robot, line, __version__))
     found = connection.execute(last.order_by(beliefs.c.id.desc()).limit(1)).first()
     if found is None:
         return None
-    rows = _rows_of(connection, _of(robot, line))
+    rows = _rows_of(connection, _of(robot, line, __version__))
     return StoredBelief(found.id, found.runs, _unpacked(found.arrays), rows)
 
 
-def _of(robot: int, line: BeliefLine, version: str = __version__) -> sa.ColumnElement[bool]:
+def _of(robot: int, line: BeliefLine, version: str) -> sa.ColumnElement[bool]:
     return sa.and_(
         beliefs.c.robot_id == robot,
         beliefs.c.follower == line.follower,
@@ -133,7 +133,11 @@ def add_belief(
     Raises:
         OutputError: If another session went on from the same belief.
     """
-    last = sa.select(sa.func.max(beliefs.c.id)).join(sessions).where(_of(rows.robot, line))
+    last = (
+        sa.select(sa.func.max(beliefs.c.id))
+        .join(sessions)
+        .where(_of(rows.robot, line, __version__))
+    )
     if connection.scalar(last) != belief.after:
         raise OutputError(
             "another session has followed this robot since its belief was read. Nothing of this "
