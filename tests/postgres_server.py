@@ -7,6 +7,7 @@ import pwd
 import shutil
 import subprocess
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,20 @@ class PostgresServer:
     def stop(self):
         """Stop the server at once, as by a lost connection."""
         self.run("pg_ctl", "-D", self.folder / "cluster", "-m", "immediate", "-w", "stop")
+
+    @contextmanager
+    def full_disk(self, size):
+        """Let no file of new connections grow beyond a size in bytes, as on a disk that is full.
+
+        It must be above that of a WAL segment, 16 MiB.
+        """
+        process = (self.folder / "cluster" / "postmaster.pid").read_text().split()[0]
+        limit = [*self._as_other, "prlimit", "--pid", process]
+        subprocess.run([*limit, f"--fsize={size}:"], check=True)
+        try:
+            yield
+        finally:
+            subprocess.run([*limit, "--fsize=unlimited:"], check=True)
 
     def close(self):
         """Stop the server and remove the cluster."""

@@ -26,6 +26,7 @@ ROOMS = (
 EXTRAS = {
     *(
         "alembic",
+        "basyx",
         "dask",
         "distributed",
         "matplotlib",

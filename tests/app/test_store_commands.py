@@ -148,6 +148,8 @@ def test_questions_and_exports(run, store, tmp_path):
     assert "open fault" in run("query", "due", "--days", 1, *store)
     run("store", "export", "--out", "tables", *store)
     assert len(list((tmp_path / "tables").glob("*.parquet"))) == 16
+    told = run("store", "export", "--aas", "arm.aasx", "--robot-name", "armpi_fpv", *store)
+    assert told == "written to arm.aasx: Nameplate, Calibration, Health, FaultHistory\n"
 
 
 @pytest.mark.parametrize(
@@ -161,6 +163,11 @@ def test_questions_and_exports(run, store, tmp_path):
         (("query", "duo", "--store", "robots.db"), "unknown query 'duo'. Did you mean 'due'"),
         (("found", "arm_7", 1), "give one of --confirmed, --wrong, --cause TEXT and --withdraw"),
         (("found", "arm_7", 1, "--wrong", "--confirmed"), "one of --confirmed, --wrong and"),
+        (("store", "export", "--store", "robots.db"), "give one of --out DIR and --aas FILE"),
+        (
+            ("store", "export", "--aas", "a.json", "--store", "robots.db"),
+            "--aas FILE and --robot-name NAME belong together. Give both",
+        ),
         (
             ("calibrate", "a.toml", "--pool", "--out", "b.toml", "--store", "robots.db"),
             "a population is not one robot: leave out --store",

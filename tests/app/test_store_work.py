@@ -10,6 +10,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import time
 from contextlib import closing
 
 import numpy as np
@@ -19,6 +20,7 @@ import failuretwin as ft
 from failuretwin.app.remembering import RobotRecord
 from failuretwin.app.shadow import Change, Snapshot
 from failuretwin.app.watch_keeper import begin_watch
+from failuretwin.connection.life_history import read_rows
 from failuretwin.connection.links.base import OK, Answer
 from failuretwin.core.hypothesis import ALL_CLEAR, RAISED, Alarm
 from failuretwin.data_knowledge.records.rows import Basis
@@ -96,6 +98,22 @@ def test_work_of_every_command_is_in_the_history(run, store, place, calibrated, 
     rows = place.sql("SELECT command, calibration_id FROM sessions ORDER BY id")
     assert rows == [("watch", "1"), ("act", "1"), ("check", "1"), ("import", "")]
     assert store.check().problems == ()
+
+
+def test_a_fault_that_act_finds_begins_an_episode_and_a_short_task_clears_none(run, file, tmp_path):
+    store = ft.open_store(file, create=True)
+    targets = ("-0.064,0.160,0.168", "0.146,-0.122,0.212", "0.022,-0.181,0.208")
+    (tmp_path / "task.csv").write_text("\n".join(("x,y,z", *targets)))
+    words = ("act", "task.csv", "--store", file, *NAME)
+    told = run(*words, "--fault", "motor_3:stuck=-0.4")
+    (episode,) = store.history("arm_7").episodes
+    assert (episode.motor, episode.mode, episode.state) == ("motor_3", "stuck", "raised")
+    assert "episode 1: motor_3 stuck, raised, since" in told.stdout
+    alarms = [text for text in texts(store.history("arm_7"), "act") if text.startswith("ALARM")]
+    assert alarms
+    assert all("motor 3 stuck at -2" in text for text in alarms)
+    assert "episode" not in run(*words).stdout
+    assert [one.state for one in store.history("arm_7").episodes] == ["raised"]
 
 
 def test_a_check_that_was_recorded_is_stored_with_its_log(run, store, place):
@@ -212,6 +230,13 @@ def test_a_robot_in_the_store_is_followed_as_by_files(
     assert stored.keys() == files.keys()
     for name, array in files.items():
         np.testing.assert_array_equal(array, stored[name], err_msg=name)
+    rows = RobotRecord(ft.open_store(place.url), "arm_7", armpi).tracked_rows()
+    assert list(rows) == read_rows(tmp_path / "cal.history.jsonl", "armpi_fpv")
+    advised = run("advise", "cal.history.jsonl", "--calibration", own, "--json", "files.json")
+    by_store = run("advise", "--store", place.url, *NAME, "--json", "store.json")
+    assert FOUND in by_store.stderr
+    assert by_store.stdout == advised.stdout
+    assert by_store.stdout.startswith("motor_1: fewer than 20 runs say something of its wear\n")
     again = run("diagnose", days / "day_0.nc", "--track", "--store", place.url, *NAME)
     assert "0 runs learned, 8 in all, 4 known already" in again.stdout
     assert place.sql("SELECT count(*), max(runs) FROM beliefs") == [("2", "8")]
@@ -247,11 +272,52 @@ def test_a_watch_goes_on_from_what_earlier_ones_have_learned(run, place, store):
     words = ("watch", "emulated", "--speed", 0, "--seconds", 70, "--calibration", "generic")
     first = run(*words, "--track", "--store", place.url, *NAME)
     assert "0 runs of movements known before" in first.stdout
+    ((known,),) = place.sql("SELECT max(runs) FROM beliefs")
     again = run(*words, "--seed", 1, "--track", "--store", place.url, *NAME)
-    rows = place.sql("SELECT runs FROM beliefs WHERE follower = 'watch' ORDER BY id")
-    known, now = (int(row[0]) for row in rows)
+    ((now,),) = place.sql("SELECT max(runs) FROM beliefs")
     assert f"{known} runs of movements known before" in again.stdout
-    assert now > known > 0
+    assert int(now) > int(known) > 0
+
+
+def test_a_killed_watch_keeps_what_it_has_learned(run, file, tmp_path):
+    ft.open_store(file, create=True)
+    words = ("watch", "emulated", "--speed", "0", "--calibration", "generic", "--track")
+    words += ("--store", str(file), *NAME)
+    with (
+        closing(sqlite3.connect(file)) as rows,
+        subprocess.Popen(
+            [sys.executable, "-m", "failuretwin", *words],
+            stdout=subprocess.DEVNULL,
+            cwd=tmp_path,
+        ) as child,
+    ):
+        while not rows.execute("SELECT 1 FROM beliefs").fetchall():
+            assert child.poll() is None
+            time.sleep(0.05)
+        os.kill(child.pid, signal.SIGKILL)
+        child.wait()
+        ((known,),) = rows.execute("SELECT sum(json_array_length(rows)) FROM beliefs")
+        ((learned,),) = rows.execute("SELECT max(runs) FROM beliefs")
+    assert known == 1 <= learned
+    again = run(*words, "--seconds", 40)
+    assert f"{learned} runs of movements known before" in again.stdout
+    with closing(sqlite3.connect(file)) as rows:
+        counts = [one[0] for one in rows.execute("SELECT runs FROM beliefs ORDER BY id")]
+    assert counts == sorted(set(counts))
+    assert counts[-1] > learned
+
+
+def test_wear_needs_a_history(run, file, tmp_path):
+    ft.open_store(file, create=True)
+    (tmp_path / "task.csv").write_text("x,y,z\n0.15,0.0,0.15\n")
+    acts, advises = ("act", "task.csv", "--wear", "store"), ("advise", *NAME)
+    for words, option, name in (
+        (acts, "--wear store needs a store", "armpi_fpv"),
+        (advises, "without --store", "arm_7"),
+    ):
+        assert option in run(*words, code=2).stderr
+        said = run(*words, "--store", file, code=2).stderr
+        assert f"robots.db: holds no tracked run of {name!r}" in said
 
 
 def test_tracking_a_watch_needs_a_store(run):

@@ -1,16 +1,15 @@
-"""The store when things go wrong: kills, two writers, full disks, other schemas, other programs."""
+"""The store when things go wrong: two writers, full disks, other schemas, other programs."""
 
 from __future__ import annotations
 
 import os
 import re
-import signal
+import shutil
 import sqlite3
 import subprocess
 import sys
 import tempfile
 import threading
-import time
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from hypothesis import strategies as st
 import failuretwin as ft
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import MotorResidual
-from failuretwin.data_knowledge.records import migrations
+from failuretwin.data_knowledge.records import migrations, writing
 from failuretwin.data_knowledge.records.beliefs import Belief, BeliefLine
 from failuretwin.data_knowledge.records.database import Database
 from failuretwin.data_knowledge.records.offsets import MotorOffset
@@ -33,6 +32,7 @@ from failuretwin.data_knowledge.records.rows import Basis
 from failuretwin.data_knowledge.records.schema import CLOSES, metadata
 from failuretwin.data_knowledge.records.sessions import Note
 from full_disks import full_disk
+from killed_writers import in_a_child
 from store_places import diagnosis
 
 NOW = datetime(2026, 3, 2, tzinfo=UTC)
@@ -190,18 +190,7 @@ def test_rows_are_not_replaced_or_truncated(full_place):
     assert full_place.sql("SELECT name FROM robots") == [("arm_7",)]
 
 
-# Kills and writers at once.
-
-
-def in_a_child(work):
-    """Run something in a process of its own and return the process id."""
-    child = os.fork()
-    if child == 0:
-        try:
-            work()
-        finally:
-            os._exit(0)
-    return child
+# Deaths and writers at once.
 
 
 def test_a_process_that_dies_while_writing_leaves_nothing(place, store):
@@ -216,35 +205,6 @@ def test_a_process_that_dies_while_writing_leaves_nothing(place, store):
     os.waitpid(in_a_child(die), 0)
     assert contents(place) == before
     assert remember(store, "arm_8").added == 1
-
-
-def test_kills_at_any_time_leave_whole_calls_and_all_that_was_said_to_be_stored(place, store):
-    for delay in (0.0, 0.02, 0.05, 0.1, 0.2):
-        acknowledged, told = os.pipe()
-
-        def work(told=told, delay=delay):
-            for number in range(1000):
-                remember(ft.open_store(place.url), f"arm {delay} {number}", count=40)
-                os.write(told, b".")
-
-        child = in_a_child(work)
-        os.close(told)
-        assert os.read(acknowledged, 1) == b"."
-        time.sleep(delay)
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        with os.fdopen(acknowledged, "rb") as pipe:
-            said = 1 + len(pipe.read())
-        whole = place.sql(
-            "SELECT robots.name, count(*) FROM robots JOIN diagnoses ON robot_id = robots.id "
-            f"WHERE robots.name LIKE 'arm {delay} %' GROUP BY robots.name"
-        )
-        assert {count for _, count in whole} == {"40"}
-        assert said <= len(whole) <= said + 1
-    assert place.sql("SELECT count(*) FROM robots WHERE id NOT IN (SELECT robot_id FROM logs)") == [
-        ("0",)
-    ]
-    assert store.check().problems == ()
 
 
 def test_two_writers_and_a_reader_at_once_lose_nothing(place, store):
@@ -321,6 +281,54 @@ def test_a_full_disk_gives_one_line_and_loses_nothing(file):
     assert store.robots() == ["arm_7"]
     assert store.check().problems == ()
     assert remember(store, "arm_8", count=2000).added == 2000
+
+
+WIDE = 1500
+"""Length of a name that no page of full ones has room for."""
+
+
+@pytest.mark.skipif(shutil.which("prlimit") is None, reason="prlimit (util-linux) is missing")
+def test_a_full_disk_of_a_server_gives_one_line_and_loses_nothing(postgres):
+    """Files of the server may not grow beyond the table of runs."""
+    place = postgres.place()
+    store = ft.open_store(place.url, create=True)
+    remember(store)
+    fill = f"SELECT 1, number, repeat('x', {WIDE}) FROM generate_series(1, 14000) AS number"
+    place.sql(f"INSERT INTO runs (log_id, position, name) {fill}")
+    ((size,),) = place.sql("SELECT pg_relation_size('runs')")
+    given = [diagnosis(str(k) + WIDE * "y", "healthy") for k in range(50)]
+    with (
+        postgres.full_disk(int(size)),
+        pytest.raises(OutputError, match=r"disk is full.*Nothing of this") as said,
+    ):
+        store.remember(given, "arm_8")
+    assert "\n" not in str(said.value)
+    assert store.robots() == ["arm_7"]
+    assert store.remember(given, "arm_8").added == 50
+
+
+def test_a_connection_that_is_lost_in_a_call_gives_one_line_and_loses_nothing(
+    postgres, monkeypatch
+):
+    place = postgres.place()
+    store = ft.open_store(place.url, create=True)
+    remember(store)
+    before, add = contents(place), writing.add_diagnoses
+
+    def lose(*given):
+        place.sql(
+            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
+            "WHERE datname = current_database() AND pid <> pg_backend_pid()"
+        )
+        return add(*given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(writing, "add_diagnoses", lose)
+        with pytest.raises(OutputError, match=r"Nothing of this was stored\. Check that") as said:
+            remember(store, "arm_8")
+    assert "\n" not in str(said.value)
+    assert contents(place) == before
+    assert remember(store, "arm_8").added == 1
 
 
 def test_a_store_is_not_made_on_a_full_disk(file):

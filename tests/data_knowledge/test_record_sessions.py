@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import time
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -118,38 +115,28 @@ def test_a_log_that_is_replayed_later_changes_no_episode(store):
     assert store.history("arm_7").episodes == ()
 
 
-def test_kills_at_any_time_leave_whole_notes_and_all_that_was_told(place, store):
-    for number, delay in enumerate((0.0, 0.01, 0.03, 0.06, 0.1, 0.2)):
-        acknowledged, out = os.pipe()
-        child = os.fork()
-        if child == 0:
-            session = watch(ft.open_store(place.url), f"arm {number}")
-            for turn in range(1000):
-                text, cause = ("ALARM", "motor_1:stuck") if turn % 2 else ("OK", "")
-                session.note(Note(at(turn + 1), text, STUCK, cause))
-                os.write(out, b".")
-            os._exit(0)
-        os.close(out)
-        assert os.read(acknowledged, 1) == b"."
-        time.sleep(delay)
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        with os.fdopen(acknowledged, "rb") as pipe:
-            said = 1 + len(pipe.read())
-        of = f"JOIN robots ON robots.id = robot_id WHERE name = 'arm {number}'"
-        ((notes,),) = place.sql(f"SELECT count(*) - 1 FROM notes {of}")
-        ((known,),) = place.sql(f"SELECT count(*) FROM diagnoses {of}")
-        ((raised,),) = place.sql(f"SELECT count(*) FROM episodes {of}")
-        assert said <= int(notes) == int(known) <= said + 1
-        assert int(raised) == int(notes) // 2
-    assert store.check().problems == ()
-
-
 def test_work_is_a_session_without_diagnoses(store, place):
     notes = [Note(at(k), f"target {k}: reached") for k in range(3)]
     store.begin("arm_7", Basis("act", None, "diagnose"), *notes)
     assert told(store.history("arm_7")) == [("act", f"target {k}: reached") for k in range(3)]
     assert store.history("arm_7").health == "no open fault"
+
+
+def test_alarms_of_work_that_is_over_begin_and_clear_episodes(store):
+    """As `act` stores them: all notes at once."""
+    unsure = Note(at(1), "ALARM", diagnosis("act", "motor_1:stuck", 0.9), "motor_1:stuck", False)
+    over, again = Note(at(2), "CLEARED", HEALTHY, ""), Note(at(3), "ALARM", STUCK, "motor_1:stuck")
+    log = LogFile("act", None, 0, at(0))
+    session = store.begin("arm_7", Basis("act"), unsure, over, again, log=log, runs=["act"])
+    found = store.history("arm_7")
+    assert [(one.state, one.raised) for one in found.episodes] == [
+        ("cleared", False),
+        ("raised", True),
+    ]
+    assert session.changed == found.episodes
+    (over,) = session.note(Note(at(4), "CLEARED", HEALTHY, ""))
+    assert (over.number, over.state) == (2, "cleared")
+    assert found.counts == {}
 
 
 def test_registered_runs_are_not_known_before_they_are_diagnosed(store, place):

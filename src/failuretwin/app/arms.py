@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -264,22 +264,26 @@ def held_of(text: str, robot: Robot) -> tuple[str, float]:
 
 
 def spared_of(
-    texts: Sequence[str], history: Path | None, model: HealthyModel, tell: Callable[[str], None]
+    texts: Sequence[str],
+    rows: Sequence[Mapping[str, Any]],
+    model: HealthyModel,
+    tell: Callable[[str], None],
 ) -> FloatArray | None:
     """Return the weights of motors to spare, (motor,); None if no motor is spared.
 
-    Texts (MOTOR or MOTOR=WEIGHT) replace the weights from the history, whose wear is told.
+    Texts (MOTOR or MOTOR=WEIGHT) replace the weights from the rows of a history, whose wear is
+    told.
 
     Raises:
-        InputError: If a motor is unknown, a weight is no number, or the history cannot be read.
+        InputError: If a motor is unknown or a weight is no number.
     """
     names = model.motor_names
     weight = np.zeros(len(names))
-    if history is not None:
-        weight = wear_weights(history, model)
+    if rows:
+        weight = wear_weights(rows, model)
         worn = [f"{names[k]} {weight[k]:.0%}" for k in np.flatnonzero(weight)]
         tell(f"worn, of what is allowed: {', '.join(worn) or 'no motor beyond doubt'}")
-        alarm = stopped_learning(history, model.twin.robot.name)
+        alarm = stopped_learning(rows)
         if alarm:
             tell(f"that is from before the history stopped to learn: {alarm}")
     for text in texts:

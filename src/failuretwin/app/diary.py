@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from failuretwin.app.terminal import tell
 from failuretwin.core.errors import InputError, counted
+from failuretwin.decision.acting.alarm import AlarmChange
 from failuretwin.decision.acting.task import TargetResult
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 
@@ -20,22 +21,22 @@ if TYPE_CHECKING:
 
 @dataclass
 class Diary:
-    """Lines about the work of an arm, in their order; calling it tells one.
+    """Entries about the work of an arm, in their order; calling it tells a line.
 
     Attributes:
-        lines: The lines so far: when (UTC), and a sentence.
+        entries: The entries so far: when (UTC), and a sentence or a change of the alarm.
     """
 
-    lines: list[tuple[datetime, str]] = field(default_factory=list)
+    entries: list[tuple[datetime, str | AlarmChange]] = field(default_factory=list)
 
     def __call__(self, text: str) -> None:
         """Tell a line and note it."""
         self.note(text)
         tell(text)
 
-    def note(self, *texts: str) -> None:
-        """Note lines."""
-        self.lines += [(datetime.now(UTC), text) for text in texts]
+    def note(self, *entries: str | AlarmChange) -> None:
+        """Note entries."""
+        self.entries += [(datetime.now(UTC), entry) for entry in entries]
 
 
 @contextmanager
@@ -55,7 +56,8 @@ def noting(
         raise
     finally:
         if stored is not None:
-            tell(stored.remember_work(command, known, method, diary.lines))
+            for line in stored.remember_work(command, known, method, diary.entries):
+                tell(line)
 
 
 def target_line(result: TargetResult) -> str:

@@ -8,7 +8,9 @@ run begins with.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
@@ -18,11 +20,14 @@ from failuretwin.app.remembering import RobotRecord
 from failuretwin.app.terminal import tell
 from failuretwin.connection.calibration.result import SETTLING_UNITS
 from failuretwin.connection.life_history import History, start_of
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, OutputError
 from failuretwin.data_knowledge.records.beliefs import Belief, BeliefLine
 from failuretwin.data_knowledge.records.offsets import MotorOffset
 from failuretwin.data_knowledge.records.rows import Basis
 from failuretwin.inference.together.life_filter import OFFSETS, LifeFilter
+
+KEEP_EVERY_S = 300.0
+"""Time between two states that a watch stores while it learns [s]."""
 
 
 class LifeKeeper:
@@ -39,7 +44,8 @@ class LifeKeeper:
         self._line = BeliefLine(follower, "")
         self._after: int | None = None
         self._keys: tuple[str, ...] = ()
-        self._runs = 0
+        self._runs = self._stored_runs = 0
+        self._due_s = -np.inf
 
     def resumed(self, start: LifeFilter) -> LifeFilter:
         """Return what the last command believed; where there is none, `start`.
@@ -55,7 +61,7 @@ class LifeKeeper:
             tell(f"{text}. Beginning anew", err=True)
         if found is None:
             return start
-        self._runs = found.runs
+        self._runs = self._stored_runs = found.runs
         self._after, self._keys = found.number, tuple(str(row.get("key", "")) for row in found.rows)
         try:
             return start.resumed(found.arrays)
@@ -84,7 +90,7 @@ class LifeKeeper:
         basis = Basis("track", record.calibration_number, f"begun with {begun.name}", "P1")
         belief = Belief(life.arrived, life.to_arrays(), rows, self._after)
         found = _offsets(life)
-        record.store.keep_belief(
+        self._after = record.store.keep_belief(
             record.name,
             basis,
             self._line,
@@ -103,9 +109,24 @@ class LifeKeeper:
         known = f"{self._runs} runs of movements known before"
         if life is None or life.arrived <= self._runs:
             return f"tracked: nothing new to learn; {known}"
-        row = {"runs": life.arrived - self._runs, "movements": life.movements}
-        self.keep(life, [row], None)
-        return f"tracked: {row['runs']} runs of movements learned; {known}"
+        self._keep_new(life)
+        return f"tracked: {life.arrived - self._runs} runs of movements learned; {known}"
+
+    def learned(self, life: LifeFilter) -> None:
+        """Store what a watch has learned so far, every `KEEP_EVERY_S`.
+
+        A watch goes on where that fails; `keep_watch` stores all at its end.
+        """
+        if time.monotonic() >= self._due_s:
+            self._due_s = time.monotonic() + KEEP_EVERY_S
+            with suppress(OutputError):
+                self._keep_new(life)
+
+    def _keep_new(self, life: LifeFilter) -> None:
+        new = life.arrived - self._stored_runs
+        if new > 0:
+            self.keep(life, [{"runs": new, "movements": life.movements}], None)
+            self._stored_runs = life.arrived
 
 
 def _offsets(life: LifeFilter) -> list[MotorOffset]:

@@ -8,14 +8,15 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from failuretwin.app.records import episode_line
 from failuretwin.app.terminal import tell
 from failuretwin.connection.calibration.result import Calibration, calibration_text
-from failuretwin.core.errors import counted
+from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import concatenate
+from failuretwin.data_knowledge.records.episodes import RAISED
 from failuretwin.data_knowledge.records.history import FaultEpisode, StoredCalibration
 from failuretwin.data_knowledge.records.log_files import LogFile, log_file
 from failuretwin.data_knowledge.records.offsets import MotorOffset
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
     from failuretwin.app.commands.options import LogOptions
     from failuretwin.data_knowledge.workers import Workforce
+    from failuretwin.decision.acting.alarm import AlarmChange
     from failuretwin.decision.test_motions.health_check import CheckResult
 
 
@@ -119,6 +121,20 @@ class RobotRecord:
             offsets=offsets,
         )
 
+    def tracked_rows(self) -> tuple[dict[str, Any], ...]:
+        """Return what `diagnose --track` keeps of each run, the oldest first.
+
+        Raises:
+            InputError: If it has followed no run of the robot.
+        """
+        rows = self.store.tracked_rows(self.name)
+        if not rows:
+            raise InputError(
+                f"{self.store.name}: holds no tracked run of {self.name!r}. Expected what "
+                "`diagnose --track` with a store keeps."
+            )
+        return rows
+
     def fault_factors(self, hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
         """Return how many times as probable faults are as by the table, and say why.
 
@@ -145,15 +161,25 @@ class RobotRecord:
         command: str,
         known: CalibratedRobot,
         method: str,
-        lines: Sequence[tuple[datetime, str]],
-    ) -> str:
-        """Store what a command did with the arm, and why; return what was stored, in a line."""
+        entries: Sequence[tuple[datetime, str | AlarmChange]],
+    ) -> list[str]:
+        """Store what a command did with the arm, and why; return what was stored, in lines."""
         figures = known.imperfections
         method = f"{method}; healthy behaviour: {figures.name}"
         basis = Basis(command, self.calibration_number, method, figures.protocol)
-        notes = [Note(at, text) for at, text in lines]
-        self.store.begin(self.name, basis, *notes, profile=self.profile)
-        return f"remembered in {self.store.name}: {command} of {self.name}"
+        notes = [_note(at, entry) for at, entry in entries]
+        log = LogFile(command, None, 0, datetime.now(UTC))
+        diagnosed = any(one.diagnosis is not None for one in notes)
+        session = self.store.begin(
+            self.name,
+            basis,
+            *notes,
+            log=log if diagnosed else None,
+            runs=[command],
+            profile=self.profile,
+        )
+        first = f"remembered in {self.store.name}: {command} of {self.name}"
+        return [first, *map(episode_line, session.changed)]
 
     def remember_check(
         self, results: Sequence[CheckResult], log: LogFile | None = None
@@ -206,6 +232,15 @@ class RobotRecord:
         )
         where = f"remembered in {self.store.name}"
         return f"{where}: calibration {kept.name} of {self.name}, in force from now on"
+
+
+def _note(at: datetime, entry: str | AlarmChange) -> Note:
+    if isinstance(entry, str):
+        return Note(at, entry)
+    fault = entry.fault
+    alarm = "" if fault is None else f"{fault.motor}:{fault.mode}"
+    certain = fault is None or fault.state == RAISED
+    return Note(at, entry.text, entry.diagnosis, alarm, certain, entry.final)
 
 
 def _check_offsets(result: CheckResult, robot: Robot) -> list[MotorOffset]:

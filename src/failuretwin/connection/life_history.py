@@ -92,13 +92,15 @@ def read_rows(path: Path, robot: str) -> list[dict[str, Any]]:
         robot: Name of the robot that it must be of.
 
     Raises:
-        InputError: If it cannot be read, is damaged, or is of another robot.
+        InputError: If it cannot be read, is damaged, is of another robot, or holds no run.
     """
     text = read_text(path, "a history")
     rows = [_object(line, f"{path}: line {n}") for n, line in enumerate(text.splitlines(), start=1)]
     of = rows[0].get("history_of") if rows else None
     if of != robot:
         raise InputError(f"{path}: is the history of {of or 'no robot'}, expected {robot!r}.")
+    if not rows[1:]:
+        raise InputError(f"{path}: holds no run. Expected what `diagnose --track` keeps.")
     return rows[1:]
 
 

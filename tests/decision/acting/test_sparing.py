@@ -10,6 +10,7 @@ from small_world import SmallWorld, carry_out, task_of
 
 from failuretwin import InputError
 from failuretwin.app.arms import spared_of
+from failuretwin.connection.life_history import read_rows
 from failuretwin.decision.acting.planner import Planner, Standing, turned_round, wear_weights
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
@@ -19,6 +20,11 @@ def history(path, rows, robot="armpi_fpv"):
     lines = [{"history_of": robot, "calibration": "0"}, *rows]
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     return path
+
+
+def kept(path, rows):
+    """Return rows as they come back from a file."""
+    return read_rows(history(path, rows), "armpi_fpv")
 
 
 def row(bias, deviation=0.0, compliance=0.0, friction=0.0):
@@ -31,47 +37,47 @@ def test_weights_are_what_a_history_says_beyond_doubt(model, tmp_path):
     scatter = wear_unit(model)[:4]
     limit = WearLimits().limit
     last = np.array([0.0, 2.0, -1.0, 9.0]) * scatter
-    path = history(tmp_path / "a.history.jsonl", [row(0.0), row(last / 2), row(last)])
-    np.testing.assert_allclose(wear_weights(path, model), [0.0, 2.0 / limit, 1.0 / limit, 1.0])
+    rows = kept(tmp_path / "a.history.jsonl", [row(0.0), row(last / 2), row(last)])
+    np.testing.assert_allclose(wear_weights(rows, model), [0.0, 2.0 / limit, 1.0 / limit, 1.0])
     # A robot is not worn by what it was like at first.
-    path = history(tmp_path / "b.history.jsonl", [row(last), row(last)])
-    np.testing.assert_array_equal(wear_weights(path, model), np.zeros(4))
+    rows = kept(tmp_path / "b.history.jsonl", [row(last), row(last)])
+    np.testing.assert_array_equal(wear_weights(rows, model), np.zeros(4))
 
 
 def test_doubt_is_no_wear(model, tmp_path):
     scatter = wear_unit(model)[:4]
     doubt = float(scatter.min())
     last = 2.0 * scatter
-    path = history(tmp_path / "a.history.jsonl", [row(0.0, doubt), row(last, doubt)])
+    rows = kept(tmp_path / "a.history.jsonl", [row(0.0, doubt), row(last, doubt)])
     expected = (last - 1.645 * np.sqrt(2.0) * doubt) / scatter / WearLimits().limit
-    np.testing.assert_allclose(wear_weights(path, model), np.maximum(expected, 0.0))
-    path = history(tmp_path / "b.history.jsonl", [row(0.0, 9.0), row(last, doubt)])
-    np.testing.assert_array_equal(wear_weights(path, model), np.zeros(4))
+    np.testing.assert_allclose(wear_weights(rows, model), np.maximum(expected, 0.0))
+    rows = kept(tmp_path / "b.history.jsonl", [row(0.0, 9.0), row(last, doubt)])
+    np.testing.assert_array_equal(wear_weights(rows, model), np.zeros(4))
 
 
 def test_friction_that_grows_is_wear_too(model, tmp_path):
     friction = wear_unit(model)[8:]
-    path = history(tmp_path / "a.history.jsonl", [row(0.0), row(0.0, friction=friction)])
-    np.testing.assert_allclose(wear_weights(path, model), np.full(4, 1.0 / WearLimits().limit))
+    rows = kept(tmp_path / "a.history.jsonl", [row(0.0), row(0.0, friction=friction)])
+    np.testing.assert_allclose(wear_weights(rows, model), np.full(4, 1.0 / WearLimits().limit))
 
 
 def test_a_history_that_stopped_to_learn_is_told(model, tmp_path):
     said = "bias of motor_2 changes faster than by wear"
-    path = history(tmp_path / "a.history.jsonl", [row(0.0), row(0.0) | {"alarm": said}])
+    rows = kept(tmp_path / "a.history.jsonl", [row(0.0), row(0.0) | {"alarm": said}])
     told = []
-    assert spared_of((), path, model, told.append) is None
+    assert spared_of((), rows, model, told.append) is None
     assert any(line.endswith(said) for line in told)
-    learns = history(tmp_path / "b.history.jsonl", [row(0.0), row(0.0) | {"alarm": ""}])
+    learns = kept(tmp_path / "b.history.jsonl", [row(0.0), row(0.0) | {"alarm": ""}])
     told.clear()
     spared_of((), learns, model, told.append)
     assert len(told) == 1
 
 
-def test_histories_of_others_are_refused(model, tmp_path):
+def test_histories_of_others_are_refused(tmp_path):
     with pytest.raises(InputError, match="expected 'armpi_fpv'"):
-        wear_weights(history(tmp_path / "a.history.jsonl", [row(0.0)], "panda"), model)
+        read_rows(history(tmp_path / "a.history.jsonl", [row(0.0)], "panda"), "armpi_fpv")
     with pytest.raises(InputError, match="holds no run"):
-        wear_weights(history(tmp_path / "b.history.jsonl", []), model)
+        read_rows(history(tmp_path / "b.history.jsonl", []), "armpi_fpv")
 
 
 @pytest.mark.parametrize("motor", [1, 2])

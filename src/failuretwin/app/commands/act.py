@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,6 +15,13 @@ from failuretwin.app.commands.store import StoreOptions, store_options
 from failuretwin.app.terminal import show, tell, write_json
 from failuretwin.connection.links import NETWORKS, ROS1
 from failuretwin.core.errors import InputError
+
+if TYPE_CHECKING:
+    from failuretwin.app.remembering import RobotRecord
+
+
+IN_STORE = Path("store")
+"""Name of the history in the store, in place of a file."""
 
 
 @click.command()
@@ -34,8 +43,8 @@ from failuretwin.core.errors import InputError
 )
 @opt.file_option(
     "--wear history",
-    "CAL.history.jsonl",
-    "History that `diagnose --track` keeps: spare motors by their wear.",
+    "CAL.history.jsonl|store",
+    "History that `diagnose --track` keeps, in a file or in the store: spare motors by their wear.",
 )
 @opt.json_option("Write one object a target, one a line.")
 @opt.arm_options
@@ -71,18 +80,36 @@ def act(
     wanted, (stored, known) = read_task(task), memory.look_up(robot)
     settings = ActingSettings(most_movements=most_movements, questions=questions)
     acting = Acting(known, safety.gate(known.robot), strategy, settings, None, robot.seed)
-    acting = replace(acting, spared=spared_of(spare, history, acting.model, tell))
+    worn = _tracked_rows(history, memory, stored, known.robot.name)
+    acting = replace(acting, spared=spared_of(spare, worn, acting.model, tell))
     with ExitStack() as stack:
         commander = commander_of(arm, known, robot.seed, stack)
         if is_moved(arm):
             with noting(stored, "act", known, strategy) as say:
-                results = acting.work(wanted, commander, say)
+                results = acting.work(wanted, commander, say, say.note)
                 say.note(*map(target_line, results))
         else:
             tell("nothing moves without --move; this is what would be ordered")
             results = acting.dry_run(wanted, first_standing(commander), tell)
     show(*result_parts(results))
     write_json([{"target": k} | r.record() for k, r in enumerate(results, start=1)], json_file)
+
+
+def _tracked_rows(
+    history: Path | None, memory: StoreOptions, stored: RobotRecord | None, robot: str
+) -> Sequence[Mapping[str, Any]]:
+    """Return what is kept of each run of a followed robot; empty: no history is named.
+
+    Raises:
+        InputError: If it cannot be read, holds no run, or is of another robot.
+    """
+    from failuretwin.connection.life_history import read_rows
+
+    if history is None:
+        return ()
+    if history == IN_STORE:
+        return memory.needed(stored, "--wear store").tracked_rows()
+    return read_rows(history, robot)
 
 
 @click.command()

@@ -113,9 +113,8 @@ def watch(
         opt.refuse_unused("nothing is moved without --probe N", *PROBING)
     model, (stored, known) = robot.model, memory.look_up(robot, learned_priors and not track)
     life = _life(memory.needed(stored, "--track")) if track else None
-    resumed = (lambda start: start) if life is None else life.resumed
     priors = _learned_priors(memory.needed(stored, LEARNED)) if learned_priors else None
-    diagnoser = monitor(known.twin, known.imperfections, budget, sensing, resumed, priors)
+    diagnoser = monitor(known.twin, known.imperfections, budget, sensing, life, priors)
     wait_s = load_topics(live.topics).wait_s
     tell(basis_line(known, robot.calibration, budget, "goals" in sensing))
     # An emulated robot ends by itself, a log when it is over.

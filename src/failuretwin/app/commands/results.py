@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from failuretwin.app.commands.store import (
     LEARNED_METHOD,
     StoreOptions,
     learned_priors_option,
-    store_option,
+    store_options,
 )
 from failuretwin.app.terminal import show, tell, write_json
 from failuretwin.core.errors import InputError, OutputError
@@ -91,7 +91,7 @@ Report = tuple[list[str], list[dict[str, Any]]]
 @opt.file_option("--template", "FILE.toml", "Write a cost table to fill in.")
 @click.option("--run", metavar="NAME", help="Run to use. Default: the last one.")
 @opt.json_option("Write the advice.")
-@store_option
+@store_options
 @learned_priors_option
 @opt.calibrated_robot_options()
 def advise(
@@ -100,24 +100,28 @@ def advise(
     template: Path | None,
     run: str | None,
     json_file: Path | None,
-    store: str | None,
+    memory: StoreOptions,
     learned_priors: bool,
     robot: opt.RobotOptions,
 ) -> None:
     """Report the cheapest action: continue, compensate, slow down, inspect, replace, stop.
 
     RESULTS.jsonl is a file of `diagnose --json`. For a history that `diagnose --track` keeps, the
-    remaining life of every motor is reported; name its calibration (--calibration).
+    remaining life of every motor is reported; name its calibration (--calibration), or the robot in
+    the store (--robot-name) in place of the file.
     """
     if template is not None:
         _write_template(template)
         tell(f"costs to be filled in: {template}")
-    if source is None:
+    if source is None and memory.robot_name is None:
         if template is None:
-            raise InputError("nothing to advise on. Name results or a history, or --template FILE.")
+            raise InputError(
+                "nothing to advise on. Name results or a history, a robot in the store "
+                "(--robot-name), or --template FILE."
+            )
         return
-    if source.name.endswith(".history.jsonl"):
-        lines, records = _life_report(source, robot)
+    if source is None or source.name.endswith(".history.jsonl"):
+        lines, records = _life_report(source, memory, robot)
     else:
         if costs is None:
             raise InputError(
@@ -126,7 +130,6 @@ def advise(
             )
         stored = None
         if learned_priors:
-            memory = StoreOptions(store, None)
             stored = memory.needed(memory.record(robot), LEARNED)
         lines, records = _results_report(source, costs, run, stored)
     show(*lines)
@@ -183,11 +186,11 @@ def _posterior(diagnosis: ft.Diagnosis | Record, stored: RobotRecord | None) -> 
     return reweighted(diagnosis.posterior, stored.fault_factors(hypotheses))
 
 
-def _life_report(source: Path, robot: opt.RobotOptions) -> Report:
-    """Return the remaining life of every motor of a tracked robot.
+def _life_report(source: Path | None, memory: StoreOptions, robot: opt.RobotOptions) -> Report:
+    """Return the remaining life of every motor of a tracked robot; no source: that of the store.
 
     Raises:
-        InputError: If the history cannot be read or belongs to another calibration.
+        InputError: If the history cannot be read, holds no run, or is of another robot.
     """
     import numpy as np
 
@@ -195,10 +198,13 @@ def _life_report(source: Path, robot: opt.RobotOptions) -> Report:
     from failuretwin.decision.remaining_life import LEAST_RUNS, motor_lives
     from failuretwin.inference.observation.healthy_model import HealthyModel
 
-    known = robot.known
-    rows = read_rows(source, known.robot.name)
-    if not rows:
-        raise InputError(f"{source}: holds no run. Expected what `diagnose --track` keeps.")
+    rows: Sequence[Mapping[str, Any]]
+    if source is None:
+        stored, known = memory.look_up(robot)
+        rows = memory.needed(stored, "--robot-name").tracked_rows()
+    else:
+        known = robot.known
+        rows = read_rows(source, known.robot.name)
     model = HealthyModel(known.twin, known.imperfections)
     lives = motor_lives(rows, model, np.random.default_rng(robot.seed))
     lines = [

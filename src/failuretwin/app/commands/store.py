@@ -163,12 +163,24 @@ def check(store: str | None) -> None:
 
 
 @store.command()
-@opt.file_option("--out", "DIR", "Folder to write to, one file a table.", required=True)
+@opt.file_option("--out", "DIR", "Write all tables as parquet to a folder, one file a table.")
+@opt.file_option(
+    "--aas shell", "FILE.aasx|FILE.json", "Write one robot as an Asset Administration Shell."
+)
+@click.option("--robot-name", metavar="NAME", help="With --aas: name of the robot.")
 @store_option
-def export(out: Path, store: str | None) -> None:
-    """Write all tables as parquet, for pandas, DuckDB and the like."""
-    rows = ft.open_store(_url(store)).export(out)
-    tell(f"written to {out}: {', '.join(f'{name} ({count})' for name, count in rows.items())}")
+def export(out: Path | None, shell: Path | None, robot_name: str | None, store: str | None) -> None:
+    """Write all tables for pandas, DuckDB and the like, or one robot for asset management."""
+    if (out is None) == (shell is None):
+        raise click.UsageError("give one of --out DIR and --aas FILE.")
+    if (shell is None) != (robot_name is None):
+        raise click.UsageError("--aas FILE and --robot-name NAME belong together. Give both.")
+    opened = ft.open_store(_url(store))
+    if out is not None:
+        rows = opened.export(out)
+        tell(f"written to {out}: {', '.join(f'{name} ({count})' for name, count in rows.items())}")
+    if shell is not None and robot_name is not None:
+        tell(f"written to {shell}: {', '.join(opened.export_shell(robot_name, shell))}")
 
 
 @click.command()

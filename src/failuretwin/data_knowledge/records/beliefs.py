@@ -76,28 +76,46 @@ def read_belief(connection: sa.Connection, robot: int, line: BeliefLine) -> Stor
     Raises:
         InputError: If it is damaged.
     """
-    query = sa.select(beliefs).join(sessions).where(_of(robot, line)).order_by(beliefs.c.id)
-    found = connection.execute(query).all()
-    if not found:
+    last = sa.select(beliefs).join(sessions).where(_of(robot, line, __version__))
+    found = connection.execute(last.order_by(beliefs.c.id.desc()).limit(1)).first()
+    if found is None:
         return None
-    rows = tuple(row for one in found for row in one.rows)
-    return StoredBelief(found[-1].id, found[-1].runs, _unpacked(found[-1].arrays), rows)
+    rows = _rows_of(connection, _of(robot, line, __version__))
+    return StoredBelief(found.id, found.runs, _unpacked(found.arrays), rows)
 
 
-def _of(robot: int, line: BeliefLine) -> sa.ColumnElement[bool]:
+def _of(robot: int, line: BeliefLine, version: str) -> sa.ColumnElement[bool]:
     return sa.and_(
         beliefs.c.robot_id == robot,
         beliefs.c.follower == line.follower,
         beliefs.c.start == line.start,
-        sessions.c.version == __version__,
+        sessions.c.version == version,
     )
+
+
+def _rows_of(connection: sa.Connection, of: sa.ColumnElement[bool]) -> tuple[dict[str, Any], ...]:
+    query = sa.select(beliefs.c.rows).join(sessions).where(of).order_by(beliefs.c.id)
+    return tuple(row for rows in connection.scalars(query) for row in rows)
+
+
+def _last(connection: sa.Connection, robot: int, follower: str) -> Any:
+    """Return start, runs and version of the last belief of a follower; None: there is none."""
+    query = sa.select(beliefs.c.start, beliefs.c.runs, sessions.c.version).join(sessions)
+    of = beliefs.c.robot_id == robot, beliefs.c.follower == follower
+    return connection.execute(query.where(*of).order_by(beliefs.c.id.desc()).limit(1)).first()
+
+
+def latest_rows(connection: sa.Connection, robot: int, follower: str) -> tuple[dict[str, Any], ...]:
+    """Return what is kept of each run of the line that was followed last, the oldest first."""
+    last = _last(connection, robot, follower)
+    if last is None:
+        return ()
+    return _rows_of(connection, _of(robot, BeliefLine(follower, last.start), last.version))
 
 
 def other_line(connection: sa.Connection, robot: int, line: BeliefLine) -> str:
     """Return why the last belief of another line is not used; empty: there is none."""
-    query = sa.select(beliefs.c.start, beliefs.c.runs, sessions.c.version).join(sessions)
-    of = beliefs.c.robot_id == robot, beliefs.c.follower == line.follower
-    last = connection.execute(query.where(*of).order_by(beliefs.c.id.desc()).limit(1)).first()
+    last = _last(connection, robot, line.follower)
     if last is None:
         return ""
     if last.start == line.start:
@@ -107,13 +125,19 @@ def other_line(connection: sa.Connection, robot: int, line: BeliefLine) -> str:
 
 def add_belief(
     connection: sa.Connection, rows: SessionRows, line: BeliefLine, belief: Belief
-) -> None:
-    """Store what is believed now as the end of a line; the robot is locked.
+) -> int:
+    """Store what is believed now as the end of a line, and return its number.
+
+    The robot is locked.
 
     Raises:
         OutputError: If another session went on from the same belief.
     """
-    last = sa.select(sa.func.max(beliefs.c.id)).join(sessions).where(_of(rows.robot, line))
+    last = (
+        sa.select(sa.func.max(beliefs.c.id))
+        .join(sessions)
+        .where(_of(rows.robot, line, __version__))
+    )
     if connection.scalar(last) != belief.after:
         raise OutputError(
             "another session has followed this robot since its belief was read. Nothing of this "
@@ -121,7 +145,8 @@ def add_belief(
         )
     stated: dict[str, Any] = {"follower": line.follower, "start": line.start, "runs": belief.runs}
     stated |= {"rows": [dict(row) for row in belief.rows], "arrays": _packed(belief.arrays)}
-    add_rows(connection, beliefs, [{**stated, "robot_id": rows.robot, "session_id": rows.session}])
+    of = {"robot_id": rows.robot, "session_id": rows.session}
+    return add_rows(connection, beliefs, [{**stated, **of}])[0]
 
 
 def _packed(arrays: Arrays) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -95,16 +96,8 @@ class Database:
         self.file = Path(parsed.database) if sqlite else None
         self.name = str(self.file or _shown(parsed))
         with needs_extra("stores on PostgreSQL need psycopg", "store"):
-            self._engine = sa.create_engine(
-                parsed,
-                poolclass=NullPool,
-                connect_args=_arguments(parsed),
-                json_serializer=_json,
-            )
+            self._engine = _engine(parsed, PATIENCE_S)
         self._one_state = {} if sqlite else {"isolation_level": "REPEATABLE READ"}
-        if sqlite:
-            sa.event.listen(self._engine, "connect", _set_up_sqlite)
-            sa.event.listen(self._engine, "begin", _begin_sqlite)
 
     @contextmanager
     def reading(self) -> Iterator[sa.Connection]:
@@ -201,6 +194,9 @@ class Database:
     def check_revision(self) -> None:
         """Raise InputError unless this is a store of the revision of this version."""
         self._check_file()
+        with suppress(SQLAlchemyError), self._engine.connect() as connection:
+            if migrations.stated_revision(connection) == migrations.HEAD:
+                return
         with self.reading() as connection:
             revision = self._known_revision(connection)
         if revision != migrations.HEAD:
@@ -249,13 +245,31 @@ def _tables(connection: sa.Connection) -> list[str]:
     return sa.inspect(connection).get_table_names()
 
 
-def _arguments(url: sa.URL) -> dict[str, Any]:
-    """Return how long the driver waits for a connection and for other writers."""
+@cache
+def _engine(url: sa.URL, patience_s: float) -> sa.Engine:
+    """Return the engine of a database, which remembers compiled statements but no connection."""
+    sqlite = url.get_backend_name() == "sqlite"
+    own: dict[str, Any] = {} if sqlite else {"use_native_hstore": False}
+    engine = sa.create_engine(
+        url,
+        poolclass=NullPool,
+        connect_args=_arguments(url, patience_s),
+        json_serializer=_json,
+        **own,
+    )
+    if sqlite:
+        sa.event.listen(engine, "connect", _set_up_sqlite)
+        sa.event.listen(engine, "begin", _begin_sqlite)
+    return engine
+
+
+def _arguments(url: sa.URL, patience_s: float) -> dict[str, Any]:
+    """Return how long the driver waits for a connection and for other writers [s]."""
     if url.get_backend_name() == "sqlite":
-        return {"timeout": PATIENCE_S}
+        return {"timeout": patience_s}
     waits = {
-        "connect_timeout": int(PATIENCE_S),
-        "options": f"-c lock_timeout={1000 * PATIENCE_S:.0f}",
+        "connect_timeout": int(patience_s),
+        "options": f"-c lock_timeout={1000 * patience_s:.0f}",
     }
     return {name: value for name, value in waits.items() if name not in url.query}
 

@@ -310,13 +310,17 @@ def _notes(connection: sa.Connection, row: int) -> tuple[StoredNote, ...]:
     return tuple(StoredNote(*found) for found in connection.execute(query))[::-1]
 
 
-def read_episodes(connection: sa.Connection, row: int) -> tuple[FaultEpisode, ...]:
-    """Return the fault episodes of a robot, the oldest first."""
-    of = episodes.c.robot_id == row
+def read_episodes(
+    connection: sa.Connection, row: int, *which: sa.ColumnElement[bool]
+) -> tuple[FaultEpisode, ...]:
+    """Return the fault episodes of a robot for which conditions hold, the oldest first."""
+    of = sa.and_(episodes.c.robot_id == row, *which)
+    rows = connection.execute(sa.select(episodes).where(of).order_by(episodes.c.number)).all()
+    if not rows:
+        return ()
     raised = sa.select(episode_events.c.episode_id).join(episodes)
     certain = set(connection.scalars(raised.where(of, episode_events.c.state == RAISED)))
     found = _findings(connection, sa.select(findings).join(episodes).where(of))
-    rows = connection.execute(sa.select(episodes).where(of).order_by(episodes.c.number))
     return tuple(
         FaultEpisode(
             *(one.id, one.number, one.motor, one.mode, one.since, one.until),

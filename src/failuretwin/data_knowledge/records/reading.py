@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import sqlalchemy as sa
 
 from failuretwin.data_knowledge.records import CHECK_DAYS, writing
+from failuretwin.data_knowledge.records.asset_shell import export_shell
 from failuretwin.data_knowledge.records.beliefs import (
     BeliefLine,
     StoredBelief,
+    latest_rows,
     other_line,
     read_belief,
 )
@@ -64,6 +67,15 @@ class StoreReader:
                 return None, ""
             found = read_belief(connection, row, line)
             return found, "" if found else other_line(connection, row, line)
+
+    def tracked_rows(self, robot: str, follower: str = "diagnose") -> tuple[dict[str, Any], ...]:
+        """Return what is kept of each run of a followed robot, the oldest first.
+
+        The runs are those of the line of beliefs that was followed last; empty: there is none.
+        """
+        with self._database.reading() as connection:
+            row = _row_of(connection, robot)
+            return () if row is None else latest_rows(connection, row, follower)
 
     def robots(self) -> list[str]:
         """Return the names of all robots, sorted."""
@@ -129,6 +141,20 @@ class StoreReader:
         """
         with self._database.reading() as connection:
             return export_parquet(connection, Path(folder))
+
+    def export_shell(self, robot: str, file: str | Path) -> list[str]:
+        """Write a robot as an Asset Administration Shell, and return the names of its submodels.
+
+        Args:
+            robot: Name of the robot.
+            file: The file, ``.aasx`` or ``.json``.
+
+        Raises:
+            InputError: If the store does not know the robot, the SDK is missing, or the suffix is
+                another.
+            OutputError: If it cannot be written; the file is as before.
+        """
+        return export_shell(self.history(robot), Path(file))
 
     def check(self) -> StoreCheck:
         """Check the database, and whether each log is where it was and as it was."""

@@ -38,8 +38,27 @@ class Basis:
 def add_rows(
     connection: sa.Connection, table: sa.Table, rows: Sequence[Mapping[str, Any]]
 ) -> list[int]:
-    """Insert rows and return their ids in the same order."""
+    """Insert rows and return their ids in the same order.
+
+    The ids of several rows are taken beforehand, so that the rows need no answer: drivers send such
+    rows several times as fast.
+    """
     if not rows:
         return []
-    statement = sa.insert(table).returning(table.c.id, sort_by_parameter_order=True)
-    return list(connection.scalars(statement, [dict(row) for row in rows]))
+    if len(rows) == 1:
+        statement = sa.insert(table).returning(table.c.id)
+        return [connection.scalars(statement, dict(rows[0])).one()]
+    ids = _new_ids(connection, table, len(rows))
+    numbered = [{**row, "id": number} for row, number in zip(rows, ids, strict=True)]
+    connection.execute(sa.insert(table), numbered)
+    return ids
+
+
+def _new_ids(connection: sa.Connection, table: sa.Table, count: int) -> list[int]:
+    """Return ids that no other row has or gets, ascending."""
+    if connection.dialect.name == "sqlite":  # there is one writer at a time
+        last = connection.scalar(sa.select(sa.func.max(table.c.id))) or 0
+        return list(range(last + 1, last + 1 + count))
+    sequence = sa.func.nextval(f"{table.name}_id_seq")
+    numbers = sa.func.generate_series(1, count).table_valued("number")
+    return sorted(connection.scalars(sa.select(sequence).select_from(numbers)))

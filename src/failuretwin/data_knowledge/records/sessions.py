@@ -12,10 +12,15 @@ import sqlalchemy as sa
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.data_knowledge.records import writing
 from failuretwin.data_knowledge.records.database import Database
-from failuretwin.data_knowledge.records.episodes import RAISED, EpisodeTracker, NamedFault
+from failuretwin.data_knowledge.records.episodes import (
+    RAISED,
+    SUSPECTED,
+    EpisodeTracker,
+    NamedFault,
+)
 from failuretwin.data_knowledge.records.history import FaultEpisode, read_episodes
 from failuretwin.data_knowledge.records.rows import SessionRows, add_rows
-from failuretwin.data_knowledge.records.schema import notes
+from failuretwin.data_knowledge.records.schema import episodes, notes
 
 
 @dataclass(frozen=True)
@@ -28,6 +33,7 @@ class Note:
         diagnosis: The diagnosis behind it; None: there is none.
         alarm: Fault that an alarm names, such as ``motor_3:stuck``; empty: the alarm is clear;
             None: there is no alarm rule, or its state is not known.
+        certain: Whether the mode of that fault is certain, not only its motor.
         final: Whether the diagnosis counts as that of a whole run.
     """
 
@@ -35,21 +41,27 @@ class Note:
     text: str
     diagnosis: Diagnosis | None = None
     alarm: str | None = None
+    certain: bool = True
     final: bool = False
 
 
 class Session:
     """A session that is going on; `Store.begin` returns one.
 
+    Attributes:
+        changed: Episodes that its first notes changed.
+
     Args:
         database: The database.
         rows: Rows that it refers to.
+        first: What its first notes changed.
     """
 
-    def __init__(self, database: Database, rows: SessionRows) -> None:
+    def __init__(self, database: Database, rows: SessionRows, first: Followed) -> None:
         self._database = database
         self._rows = rows
-        self._alarmed: tuple[str, ...] = ()
+        self._alarmed = first.alarmed
+        self.changed = first.episodes
 
     @property
     def number(self) -> int:
@@ -64,26 +76,52 @@ class Session:
         """
         with self._database.writing() as connection:
             writing.lock_robot(connection, self._rows.robot)
-            changed, alarmed = self._follow(connection, happened)
-            known = read_episodes(connection, self._rows.robot) if changed else ()
-        self._alarmed = alarmed
-        return tuple(one for one in known if one.row in changed)
+            followed = follow_notes(connection, self._rows, happened, self._alarmed)
+        self._alarmed = followed.alarmed
+        return followed.episodes
 
-    def _follow(
-        self, connection: sa.Connection, happened: Sequence[Note]
-    ) -> tuple[list[int], tuple[str, ...]]:
-        """Write notes, their diagnoses and the episodes; return these, and the alarmed motors."""
-        robot, alarmed = self._rows.robot, self._alarmed
-        tracker = writing.tracker_of(connection, robot)
-        latest = writing.latest_run(connection, robot)
-        behind = writing.add_session_diagnoses(
-            connection, self._rows, [(one.at, one.diagnosis) for one in happened]
-        )
-        for number, one in enumerate(happened):
-            if behind[number] is not None and (latest is None or one.at >= latest):
-                alarmed = _follow_note(tracker, one, number, alarmed)
-        add_notes(connection, self._rows, happened, behind)
-        return writing.keep_episodes(connection, robot, tracker.changed, behind), alarmed
+
+@dataclass(frozen=True)
+class Followed:
+    """What notes have changed.
+
+    Attributes:
+        episodes: Episodes that began, were raised or were cleared.
+        alarmed: Motors that the alarm of the session names now.
+    """
+
+    episodes: tuple[FaultEpisode, ...]
+    alarmed: tuple[str, ...]
+
+
+def follow_notes(
+    connection: sa.Connection,
+    rows: SessionRows,
+    happened: Sequence[Note],
+    alarmed: tuple[str, ...] = (),
+) -> Followed:
+    """Write notes of a session and their diagnoses, and let the episodes follow them.
+
+    Args:
+        connection: Connection to the store.
+        rows: Rows that the session refers to.
+        happened: The notes, the oldest first.
+        alarmed: Motors that the alarm of the session named before.
+    """
+    if all(one.diagnosis is None for one in happened):
+        _add_notes(connection, rows, happened, [None] * len(happened))
+        return Followed((), alarmed)
+    tracker = writing.tracker_of(connection, rows.robot)
+    latest = writing.latest_run(connection, rows.robot)
+    given = [(one.at, one.diagnosis) for one in happened]
+    behind = writing.add_session_diagnoses(connection, rows, given)
+    for number, one in enumerate(happened):
+        if behind[number] is not None and (latest is None or one.at >= latest):
+            alarmed = _follow_note(tracker, one, number, alarmed)
+    _add_notes(connection, rows, happened, behind)
+    changed = writing.keep_episodes(connection, rows.robot, tracker.changed, behind)
+    known = read_episodes(connection, rows.robot, episodes.c.id.in_(changed)) if changed else ()
+    return Followed(known, alarmed)
 
 
 def _follow_note(
@@ -95,22 +133,22 @@ def _follow_note(
     if note.alarm is None:
         return alarmed
     faults = Hypothesis.parse(note.alarm).faults if note.alarm else ()
-    named = [NamedFault(fault.motor, fault.mode, RAISED) for fault in faults]
+    state = RAISED if note.certain else SUSPECTED
+    named = [NamedFault(fault.motor, fault.mode, state) for fault in faults]
     tracker.follow_alarm(alarmed, named, note.at, number)
     return tuple(fault.motor for fault in named)
 
 
-def add_notes(
+def _add_notes(
     connection: sa.Connection,
     rows: SessionRows,
     happened: Sequence[Note],
-    behind: Sequence[int | None] = (),
+    behind: Sequence[int | None],
 ) -> None:
     """Write notes of a session; `behind` are the rows of their diagnoses."""
     of = {"session_id": rows.session, "robot_id": rows.robot}
-    known = behind or [None] * len(happened)
     stated: list[dict[str, Any]] = [
         {**of, "at": one.at, "text": one.text, "diagnosis_id": row}
-        for one, row in zip(happened, known, strict=True)
+        for one, row in zip(happened, behind, strict=True)
     ]
     add_rows(connection, notes, stated)

@@ -42,8 +42,8 @@ from failuretwin.data_knowledge.records.log_files import LogFile, log_file, utc
 from failuretwin.data_knowledge.records.offsets import MotorOffset, add_offsets
 from failuretwin.data_knowledge.records.reading import StoreReader
 from failuretwin.data_knowledge.records.rows import Basis, SessionRows, add_rows
-from failuretwin.data_knowledge.records.schema import repairs
-from failuretwin.data_knowledge.records.sessions import Note, Session, add_notes
+from failuretwin.data_knowledge.records.schema import episodes, repairs
+from failuretwin.data_knowledge.records.sessions import Note, Session, follow_notes
 from failuretwin.data_knowledge.records.statements import (
     add_finding,
     replace_calibration,
@@ -127,7 +127,7 @@ class Store(StoreReader):
             row = writing.keep_robot(connection, robot, profile)
             at = writing.keep_log(connection, row, source)
             names = [one.run for one in diagnoses]
-            run_rows, _ = writing.keep_runs(connection, at, names, details)
+            run_rows = writing.keep_runs(connection, at, names, details)
             kept, seen = writing.new_diagnoses(connection, at, diagnoses, run_rows, calibration)
             if not kept:
                 return Remembered(0, len(diagnoses), ())
@@ -161,8 +161,8 @@ class Store(StoreReader):
         Args:
             robot: Name of the robot, made if it is new.
             basis: The command, and what its results rest on.
-            happened: First notes.
-            log: The log, by path and checksum; None: there is none.
+            happened: First notes; episodes follow their diagnoses.
+            log: The log, by path and checksum; None: there is none, nor a diagnosis.
             runs: Names of its runs; diagnoses of the session belong to the first.
             profile: The robot's profile, stored if it is new.
 
@@ -175,11 +175,11 @@ class Store(StoreReader):
             known = list[int]()
             if log is not None:
                 at = writing.keep_log(connection, row, log)
-                known, _ = writing.keep_runs(connection, at, runs, [None] * len(runs))
+                known = writing.keep_runs(connection, at, runs, [None] * len(runs))
             session = writing.add_session(connection, row, basis)
             of = SessionRows(session, row, known[0] if known else None)
-            add_notes(connection, of, happened)
-        return Session(self._database, of)
+            first = follow_notes(connection, of, happened)
+        return Session(self._database, of, first)
 
     def keep_belief(
         self,
@@ -190,8 +190,11 @@ class Store(StoreReader):
         at: datetime,
         offsets: Sequence[MotorOffset] = (),
         profile: Robot | None = None,
-    ) -> None:
+    ) -> int:
         """Store the posterior of theta of a robot, from which the next session goes on.
+
+        Returns:
+            Number of the belief.
 
         Args:
             robot: Name of the robot, made if it is new.
@@ -208,8 +211,8 @@ class Store(StoreReader):
         with self._database.writing() as connection:
             row = writing.keep_robot(connection, robot, profile)
             of = SessionRows(writing.add_session(connection, row, basis), row)
-            add_belief(connection, of, line, belief)
             add_offsets(connection, of, at, offsets)
+            return add_belief(connection, of, line, belief)
 
     # People.
 
@@ -382,4 +385,4 @@ def _details(runs: xr.Dataset | None, count: int) -> list[dict[str, float] | Non
 def _episodes_of(
     connection: sa.Connection, robot: int, changed: Sequence[int]
 ) -> tuple[FaultEpisode, ...]:
-    return tuple(one for one in read_episodes(connection, robot) if one.row in changed)
+    return read_episodes(connection, robot, episodes.c.id.in_(changed)) if changed else ()

@@ -6,7 +6,7 @@ import hashlib
 import json
 import tomllib
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -63,14 +63,15 @@ def keep_robot(connection: sa.Connection, name: str, profile: Robot | None) -> i
     """Return the row of a robot, made if it is new, and keep other writers from it meanwhile."""
     if not name.strip() or not name.isprintable():
         raise InputError(f"robot name {name!r} cannot be shown. Expected plain characters.")
-    # ON CONFLICT is the same on both engines; SQLAlchemy has it by dialect only.
-    add = sa.text("INSERT INTO robots (name, added) VALUES (:name, :added) ON CONFLICT DO NOTHING")
-    add = add.bindparams(
-        sa.bindparam("name", name, robots.c.name.type),
-        sa.bindparam("added", datetime.now(UTC), robots.c.added.type),
-    )
-    connection.execute(add)
-    row = find_locked(connection, name)
+    row = _locked(connection, name)
+    if row is None:
+        # ON CONFLICT is the same on both engines; SQLAlchemy has it by dialect only.
+        text = "INSERT INTO robots (name, added) VALUES (:name, :added) ON CONFLICT DO NOTHING"
+        added = sa.bindparam("added", datetime.now(UTC), robots.c.added.type)
+        connection.execute(
+            sa.text(text).bindparams(sa.bindparam("name", name, robots.c.name.type), added)
+        )
+        row = find_locked(connection, name)
     if profile is not None:
         _keep_profile(connection, row, profile)
     return row
@@ -78,9 +79,13 @@ def keep_robot(connection: sa.Connection, name: str, profile: Robot | None) -> i
 
 def find_locked(connection: sa.Connection, name: str) -> int:
     """Return the row of a known robot and keep other writers from it meanwhile."""
-    row = find_robot(connection, name)
-    lock_robot(connection, row)
-    return row
+    row = _locked(connection, name)
+    return find_robot(connection, name) if row is None else row
+
+
+def _locked(connection: sa.Connection, name: str) -> int | None:
+    query = sa.select(robots.c.id).where(robots.c.name == name)
+    return connection.scalar(query.with_for_update())
 
 
 def lock_robot(connection: sa.Connection, row: int) -> None:
@@ -124,33 +129,42 @@ def text_checksum(text: str) -> str:
 # Logs and runs.
 
 
-def keep_log(connection: sa.Connection, robot: int, log: LogFile) -> int:
-    """Return the row of a log, made if its contents are new."""
+@dataclass(frozen=True)
+class StoredLog:
+    """A log in the store: its row, and whether its contents were new."""
+
+    row: int
+    new: bool
+
+
+def keep_log(connection: sa.Connection, robot: int, log: LogFile) -> StoredLog:
+    """Return a log of the store, made if its contents are new."""
     if log.sha256 is not None:
         same = sa.select(logs.c.id).where(logs.c.robot_id == robot, logs.c.sha256 == log.sha256)
         row = connection.scalar(same)
         if row is not None:
-            return row
+            return StoredLog(row, new=False)
     stated: dict[str, Any] = {"path": log.path, "sha256": log.sha256, "bytes": log.size_bytes}
     stated |= {"robot_id": robot, "recorded": log.recorded, "added": datetime.now(UTC)}
-    return add_rows(connection, logs, [stated])[0]
+    return StoredLog(add_rows(connection, logs, [stated])[0], new=True)
 
 
 def keep_runs(
-    connection: sa.Connection, log: int, names: Sequence[str], details: Sequence[Any]
-) -> tuple[list[int], int]:
-    """Return the rows of the runs of a log, in its order, and how many of them are new."""
-    query = sa.select(runs.c.position, runs.c.name, runs.c.id).where(runs.c.log_id == log)
-    known = {(one.position, one.name): one.id for one in connection.execute(query)}
+    connection: sa.Connection, log: StoredLog, names: Sequence[str], details: Sequence[Any]
+) -> list[int]:
+    """Return the rows of the runs of a log, in its order."""
+    query = sa.select(runs.c.position, runs.c.name, runs.c.id).where(runs.c.log_id == log.row)
+    stored = [] if log.new else connection.execute(query).all()
+    known = {(one.position, one.name): one.id for one in stored}
     wanted = list(enumerate(map(storable, names)))
     rows = [
-        {"log_id": log, "position": k, "name": name, "details": details[k]}
+        {"log_id": log.row, "position": k, "name": name, "details": details[k]}
         for k, name in wanted
         if (k, name) not in known
     ]
     added = add_rows(connection, runs, rows)
     known |= {(one["position"], one["name"]): row for one, row in zip(rows, added, strict=True)}
-    return [known[key] for key in wanted], len(added)
+    return [known[key] for key in wanted]
 
 
 # Sessions.
@@ -172,13 +186,13 @@ Kept = list[tuple[Diagnosis, int, str]]
 
 def new_diagnoses(
     connection: sa.Connection,
-    log: int,
+    log: StoredLog,
     diagnoses: Sequence[Diagnosis],
     run_rows: Sequence[int],
     calibration: int | None,
 ) -> tuple[Kept, set[int]]:
     """Return the diagnoses that are not stored yet, and the runs that have one already."""
-    known = _stored_digests(connection, log)
+    known = set() if log.new else _stored_digests(connection, log.row)
     each = [
         (one, row, _digest_of(one, calibration))
         for one, row in zip(diagnoses, run_rows, strict=True)
@@ -268,8 +282,7 @@ def tracker_of(connection: sa.Connection, robot: int) -> EpisodeTracker:
             one.row,
             one.refuted,
         )
-        for one in read_episodes(connection, robot)
-        if one.until is None
+        for one in read_episodes(connection, robot, episodes.c.until.is_(None))
     )
 
 
@@ -300,6 +313,8 @@ def keep_episodes(
 def _new_episodes(
     connection: sa.Connection, robot: int, fresh: Sequence[Course]
 ) -> list[dict[str, Any]]:
+    if not fresh:
+        return []
     last = sa.select(sa.func.max(episodes.c.number)).where(episodes.c.robot_id == robot)
     first = (connection.scalar(last) or 0) + 1
     return [

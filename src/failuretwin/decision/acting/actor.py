@@ -95,7 +95,7 @@ class Actor:
         self._attempt = _Attempt()
         self._since_probe = 0
         self.ways: list[tuple[FloatArray, Standing]] = []  # see `Planner.sparing_lines`
-        self._judgement: Judgement | None = None
+        self.judgement: Judgement | None = None
         self._questions = self._settings.questions
 
     # What is known.
@@ -140,8 +140,8 @@ class Actor:
         self._seen = seen = Seen(*told, start_s, rest_s, point)
         self.belief.add(seen)
         judge, belief = self._judge, self.belief
-        self._judgement = None if judge is None else judge(belief.window, belief.believed)
-        news = self.belief.take(seen, self._judgement)
+        self.judgement = None if judge is None else judge(belief.window, belief.believed)
+        news = self.belief.take(seen, self.judgement)
         if news:
             self._say(news)
             self._tell_reaction()
@@ -234,7 +234,7 @@ class Actor:
 
     def _question(self) -> Order | None:
         """Return a movement that asks what is wrong, while that is open; None: none is made."""
-        judgement = self._judgement
+        judgement = self.judgement
         if not self._questions or judgement is None or self.belief.believed is not None:
             return None
         if judgement.probability(judgement.best) >= LEFT_OPEN:

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
+from failuretwin.core.hypothesis import HEALTHY, Diagnosis, Hypothesis, single_faults
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import HALF_90, BelievedArm, BelievedFault, Seen
@@ -36,7 +36,8 @@ from failuretwin.inference.faults.priors import MONITORING
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.posterior import LEVELS, Posterior, compute_posterior
+from failuretwin.inference.observation.log_quality import LogQuality
+from failuretwin.inference.posterior import LEVELS, Posterior, StreamPosition, compute_posterior
 
 # What the latest movements say.
 
@@ -99,6 +100,10 @@ class Judgement:
         motors = {fault.motor for fault in best.faults}
         twins = [h for h in (*constant, *drawn_anew) if h.faults[0].motor in motors]
         return best, sum(map(self.probability, twins))
+
+    def diagnosis(self, begin_s: float = 0.0) -> Diagnosis:
+        """Return the diagnosis of the movements, the first of which began at a time [s]."""
+        return self.posterior.to_diagnosis(0, "act", LogQuality(), None, StreamPosition(begin_s))
 
     def log_evidence(self, hypothesis: Hypothesis) -> float:
         """Return log p(movements | hypothesis)."""
@@ -240,6 +245,11 @@ class Belief:
     def window(self) -> Sequence[Seen]:
         """The latest movements that were seen at rest."""
         return self.history[-WINDOW:]
+
+    @property
+    def since_s(self) -> float:
+        """When the first of them began [s]."""
+        return self.window[0].start_s if self.history else 0.0
 
     @property
     def confirmed(self) -> bool:

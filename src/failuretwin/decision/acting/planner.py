@@ -19,14 +19,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from failuretwin.connection.life_history import read_rows
 from failuretwin.connection.links.base import Order
-from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.acting.believed_arm import HALF_90, BelievedArm
 from failuretwin.decision.acting.safety import SafetyGate
@@ -270,17 +267,11 @@ TRACKED = ("bias", "compliance", "friction")
 """What a history follows of each motor, in the order of `wear_unit`."""
 
 
-def wear_weights(history: Path, model: HealthyModel) -> FloatArray:
+def wear_weights(rows: Sequence[Mapping[str, Any]], model: HealthyModel) -> FloatArray:
     """Return how worn each motor is, in shares of what is allowed, (motor,) [-], 1 at most.
 
-    `history` is CAL.history.jsonl of `diagnose --track`.
-
-    Raises:
-        InputError: If the history cannot be read, is of another robot, or holds no run.
+    `rows` are what `diagnose --track` keeps of each run, at least one.
     """
-    rows = read_rows(history, model.twin.robot.name)
-    if not rows:
-        raise InputError(f"{history}: holds no run. Expected what `diagnose --track` keeps.")
     change, doubt = (_change(rows, suffix) for suffix in ("", "_deviation"))
     unit = wear_unit(model).reshape(len(TRACKED), -1)
     beyond = np.maximum(np.abs(change) - HALF_90 * doubt, 0.0)
@@ -288,14 +279,9 @@ def wear_weights(history: Path, model: HealthyModel) -> FloatArray:
     return np.asarray(np.minimum(worn.max(axis=0) / WearLimits().limit, 1.0))
 
 
-def stopped_learning(history: Path, robot: str) -> str:
-    """Return why a history learns no more: what changed as no wear does; empty if it learns.
-
-    Raises:
-        InputError: If it cannot be read or is of another robot.
-    """
-    rows = read_rows(history, robot)
-    return str(rows[-1].get("alarm", "")) if rows else ""
+def stopped_learning(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return why a history learns no more: what changed as no wear does; empty if it learns."""
+    return str(rows[-1].get("alarm", ""))
 
 
 def _change(rows: Sequence[Mapping[str, Any]], suffix: str) -> FloatArray:

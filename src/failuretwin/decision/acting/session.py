@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+from failuretwin.connection.life_history import read_rows
 from failuretwin.connection.links.base import Commander
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.actor import Actor
+from failuretwin.decision.acting.alarm import AlarmChange, FaultAlarm
 from failuretwin.decision.acting.belief import Belief, Judge
 from failuretwin.decision.acting.believed_arm import BelievedArm
 from failuretwin.decision.acting.planner import Plan, Planner, Standing, wear_weights
@@ -72,12 +74,26 @@ class Acting:
         return Actor(self.planner, model, task, Belief(model), standing, settings, judge, tell)
 
     def work(
-        self, task: Task, commander: Commander, tell: Callable[[str], None]
+        self,
+        task: Task,
+        commander: Commander,
+        tell: Callable[[str], None],
+        report: Callable[[AlarmChange], None] = lambda change: None,
     ) -> Sequence[TargetResult]:
-        """Carry a task out on an arm and return what became of each target."""
+        """Carry a task out on an arm and return what became of each target.
+
+        Args:
+            task: The task.
+            commander: The arm.
+            tell: Called with what is found out and done, as it happens.
+            report: Called with each change of the alarm.
+        """
         standing = first_standing(commander)
-        actor = self.actor(task, standing, tell)
-        Work(actor, self.gate, commander, standing).carry_out()
+        actor, alarm = self.actor(task, standing, tell), FaultAlarm(report)
+        work = Work(actor, self.gate, commander, standing)
+        work.seen = lambda: alarm.see(actor.belief, actor.judgement)
+        work.carry_out()
+        alarm.end()
         for line in self.planner.sparing_lines(actor.ways):
             tell(line)
         return actor.results
@@ -145,5 +161,6 @@ def act(
     gate = SafetyGate(known.robot, limits or SafetyLimits())
     acting = Acting(known, gate, strategy, ActingSettings())
     if history is not None:
-        acting = replace(acting, spared=wear_weights(Path(history), acting.model))
+        rows = read_rows(Path(history), known.robot.name)
+        acting = replace(acting, spared=wear_weights(rows, acting.model))
     return acting.work(task, commander, tell)

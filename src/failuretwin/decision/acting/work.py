@@ -171,6 +171,7 @@ class Work:
         commander: The arm.
         standing: What its motors were told last, (motor,) [rad].
         hear: Called with each event before it counts; None: nothing came just now.
+        seen: Called after each movement that was seen.
     """
 
     actor: Worker
@@ -178,6 +179,7 @@ class Work:
     commander: Commander
     standing: FloatArray
     hear: Callable[[Event | None], object] = lambda event: None
+    seen: Callable[[], object] = lambda: None
 
     def __post_init__(self) -> None:
         self._now = 0.0
@@ -197,6 +199,7 @@ class Work:
             start = self._now
             point = self._rest(order, start)
             self.actor.see(point, start, self._now)
+            self.seen()
 
     # Sending.
 

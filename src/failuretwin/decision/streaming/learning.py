@@ -6,9 +6,9 @@ the others alone (`LifeFilter`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -34,6 +34,18 @@ TIMED = 200
 """Latest movements whose commands tell how late this robot starts."""
 
 
+class LifeMemory(Protocol):
+    """Keeps what watches learn of a robot from watch to watch."""
+
+    def resumed(self, start: LifeFilter) -> LifeFilter:
+        """Return what earlier watches have learned, given what arms of its kind are like."""
+        ...
+
+    def learned(self, life: LifeFilter) -> None:
+        """Take what is believed after another run; it changes later."""
+        ...
+
+
 class LifeLearner:
     """Learns of one robot from its movements, beginning with what arms of its kind are like.
 
@@ -43,17 +55,19 @@ class LifeLearner:
 
     Args:
         diagnoser: The method, with its hypotheses and priors.
-        resumed: Returns what to begin with in place of what arms of its kind are like.
+        memory: What keeps what is learned; None: nothing does.
     """
 
     def __init__(
         self,
         diagnoser: BayesDiagnoser,
-        resumed: Callable[[LifeFilter], LifeFilter] = lambda start: start,
+        memory: LifeMemory | None = None,
     ) -> None:
         known = replace(diagnoser.priors, setup=SetupPrior.known())
         self._diagnoser = replace(diagnoser, priors=known)
-        self._life = resumed(begin(self._diagnoser, cold=True))
+        self._memory = memory
+        start = begin(self._diagnoser, cold=True)
+        self._life = start if memory is None else memory.resumed(start)
         self._waiting: list[SettledEvidence] = []
         self._told: Movements | None = None
         self._worker = ThreadPoolExecutor(1, "learning")
@@ -82,6 +96,8 @@ class LifeLearner:
             self._waiting = self._waiting[1:]
             return False
         taught = self._finish()
+        if taught and self._memory is not None:
+            self._memory.learned(self._life)
         seen, self._waiting = _joined(self._waiting), []
         told = seen.movements
         self._told = told if self._told is None else _followed_by(self._told, told)

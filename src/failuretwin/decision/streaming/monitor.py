@@ -7,7 +7,7 @@ the robot itself teaches (`HealthyMixture`, `LifeLearner`); the alarm comes from
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
 from failuretwin.decision.streaming.diagnoser import RobotStream
 from failuretwin.decision.streaming.fleet import StreamingFleet
-from failuretwin.decision.streaming.learning import LifeLearner
+from failuretwin.decision.streaming.learning import LifeLearner, LifeMemory
 from failuretwin.decision.streaming.set_up_watch import PROOF, SetUpWatch
 from failuretwin.decision.streaming.trouble import DEAD, rests_throughout
 from failuretwin.digital_model.arm_classes import generic_imperfections
@@ -89,8 +89,7 @@ class FaultMonitor(RobotStream):
     Args:
         diagnoser: The method, with its hypotheses and healthy behaviour.
         false_alarms_per_100h: False alarms that are allowed in 100 hours of work.
-        resumed: Returns what earlier watches have learned of the robot, given what its kind is
-            like.
+        memory: What keeps what is learned of the robot from watch to watch; None: nothing does.
 
     Raises:
         InputError: If the budget makes no sense, or a hypothesis cannot be followed.
@@ -100,13 +99,13 @@ class FaultMonitor(RobotStream):
         self,
         diagnoser: BayesDiagnoser,
         false_alarms_per_100h: float = 1.0,
-        resumed: Callable[[LifeFilter], LifeFilter] = lambda start: start,
+        memory: LifeMemory | None = None,
     ) -> None:
         super().__init__(StreamingFleet(diagnoser, 1))
         known = diagnoser.healthy_model
         ideal, cold = known.imperfections.settling is None, known.imperfections.of_class
         learns = known.sensors.tool_alone and not ideal
-        self._learner = LifeLearner(diagnoser, resumed) if learns else None
+        self._learner = LifeLearner(diagnoser, memory) if learns else None
         self._models: list[HealthyModel] = [] if cold and learns else [known]
         if self._learner is not None:
             self._models.append(self._learner.model)
@@ -295,7 +294,7 @@ def monitor(
     imperfections: HealthyLike = None,
     false_alarms_per_100h: float = 1.0,
     sensing: str | None = None,
-    resumed: Callable[[LifeFilter], LifeFilter] = lambda start: start,
+    memory: LifeMemory | None = None,
     priors: Priors | None = None,
 ) -> FaultMonitor:
     """Return what watches a robot at work: settled poses, and faults are rare.
@@ -306,9 +305,8 @@ def monitor(
             None: as its profile says.
         false_alarms_per_100h: False alarms that are allowed in 100 hours of work.
         sensing: ``tool``, with ``+encoders``, ``+goals`` or both; None: the tool's position alone.
-        resumed: Returns what earlier watches have learned of the robot, given what its kind is
-            like.
+        memory: What keeps what is learned of the robot from watch to watch; None: nothing does.
         priors: Beliefs about faults; None: the usual ones.
     """
     diagnoser = BayesDiagnoser(twin, imperfections, priors=priors, whole_run=False, sensing=sensing)
-    return FaultMonitor(diagnoser, false_alarms_per_100h, resumed)
+    return FaultMonitor(diagnoser, false_alarms_per_100h, memory)

@@ -43,6 +43,15 @@ def revision_of(connection: sa.Connection) -> str | None:
     """Return the revision of a database; None where no store has been made."""
     if not sa.inspect(connection).has_table(REVISION_TABLE):
         return None
+    return stated_revision(connection)
+
+
+def stated_revision(connection: sa.Connection) -> str | None:
+    """Return what the table of the revision states.
+
+    Raises:
+        sqlalchemy.exc.SQLAlchemyError: If there is no such table.
+    """
     revision = sa.column("version_num", sa.String)
     return connection.scalar(sa.select(revision).select_from(sa.table(REVISION_TABLE)))
 

@@ -1,0 +1,238 @@
+"""Export of one robot as an Asset Administration Shell (AAS), by the Eclipse BaSyx SDK.
+
+The shell has four submodels: nameplate, calibration in force, health, and fault history. The
+nameplate has the semantic ids of IDTA 02006-3-0 (Digital Nameplate) for what the store knows.
+
+Section: docs/store.md#asset-administration-shell
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from failuretwin.core.errors import InputError, needs_extra
+from failuretwin.data_knowledge.records.history import FaultEpisode, History
+from failuretwin.data_knowledge.store import replacing
+
+if TYPE_CHECKING:
+    from basyx.aas import model
+
+FORMATS = (".aasx", ".json")
+"""Suffixes of the files: a package, or the bare JSON document."""
+URN = "urn:failuretwin"
+NAMEPLATE = "https://admin-shell.io/idta/nameplate/3/0/Nameplate"
+"""Semantic id of the submodel template."""
+NAMEPLATE_ELEMENTS = {
+    "URIOfTheProduct": "0112/2///61987#ABN590#002",
+    "ManufacturerProductDesignation": "0112/2///61987#ABA567#009",
+}
+"""Semantic ids of its elements (IEC CDD)."""
+LANGUAGE = "en"
+NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Characters that XML cannot hold; U+FFFD takes their place."""
+
+Content = Mapping[str, Any]
+"""Elements by name: a text, number, instant or bytes, a `Content`, or a list of them."""
+
+
+def export_shell(history: History, file: Path) -> list[str]:
+    """Write a robot to an ``.aasx`` or ``.json`` file, and return the names of the submodels.
+
+    Times are UTC. A value that is not known has no element.
+
+    Raises:
+        InputError: If the SDK is missing, or the suffix is another.
+        OutputError: If the file cannot be written; it is as before.
+    """
+    if file.suffix.lower() not in FORMATS:
+        raise InputError(f"{file}: has suffix {file.suffix!r}, expected {' or '.join(FORMATS)}.")
+    with needs_extra("asset administration shells need basyx-python-sdk", "aas"):
+        from basyx.aas import model
+        from basyx.aas.adapter import aasx, json
+    shell, submodels = _shell(history)
+    objects = model.DictIdentifiableStore[model.Identifiable]([shell, *submodels])
+    with replacing(file) as partial:
+        if file.suffix.lower() == ".json":
+            json.write_aas_json_file(str(partial), objects)
+        else:
+            with aasx.AASXWriter(str(partial), failsafe=False) as writer:
+                writer.write_aas(shell.id, objects, aasx.DictSupplementaryFileContainer())
+    return [str(one.id_short) for one in submodels]
+
+
+def _shell(history: History) -> tuple[model.AssetAdministrationShell, list[model.Submodel]]:
+    from basyx.aas import model
+
+    name = quote(history.robot, safe="")
+    asset = f"{URN}:robot:{name}"
+    contents = {
+        "Nameplate": _nameplate(history, asset),
+        "Calibration": _calibration(history),
+        "Health": _health(history),
+        "FaultHistory": _faults(history),
+    }
+    submodels = [
+        model.Submodel(
+            f"{URN}:submodel:{name}:{kind}",
+            _elements(content, NAMEPLATE_ELEMENTS if kind == "Nameplate" else {}),
+            id_short=kind,
+            semantic_id=_meaning(
+                NAMEPLATE if kind == "Nameplate" else f"{URN}:semantics:{kind}:1:0"
+            ),
+        )
+        for kind, content in contents.items()
+    ]
+    shell = model.AssetAdministrationShell(
+        model.AssetInformation(
+            model.AssetKind.INSTANCE,
+            global_asset_id=asset,
+            specific_asset_id=[model.SpecificAssetId("robot", _text(history.robot))],
+        ),
+        f"{URN}:shell:{name}",
+        id_short="Robot",
+        submodel={model.ModelReference.from_referable(one) for one in submodels},
+    )
+    return shell, submodels
+
+
+# Contents of the submodels.
+
+
+def _nameplate(history: History, asset: str) -> Content:
+    return {
+        "URIOfTheProduct": asset,
+        "ManufacturerProductDesignation": history.kind or None,
+    }
+
+
+def _calibration(history: History) -> Content:
+    """Return the calibration in force; empty: the robot has none."""
+    found = next((one for one in history.calibrations if one.valid_to is None), None)
+    if found is None:
+        return {}
+    return {
+        "Number": found.number,
+        "Name": found.name,
+        "Protocol": found.protocol,
+        "ValidFrom": found.valid_from,
+        "Document": found.document.encode(),
+    }
+
+
+def _health(history: History) -> Content:
+    """Return the state of the robot: sentence, counts, last diagnosis, last offsets [unit]."""
+    last = history.recent[-1] if history.recent else None
+    content: dict[str, Any] = {
+        "Summary": history.health,
+        "OpenFaults": len(history.open_episodes),
+        "DiagnosedRuns": [
+            {"State": state, "Runs": count} for state, count in sorted(history.counts.items())
+        ],
+        "Offsets": [
+            {
+                "Motor": one.motor,
+                "Name": one.name,
+                "Unit": one.unit,
+                "At": one.at[-1],
+                "Mean": one.values[-1],
+                "Deviation": one.deviations[-1],
+            }
+            for one in history.drifts
+        ],
+    }
+    if last is not None:
+        content["LastDiagnosis"] = {
+            "At": last.at,
+            "Run": last.run,
+            "State": last.state,
+            "Verdict": last.verdict,
+        }
+    return content
+
+
+def _faults(history: History) -> Content:
+    return {
+        "Episodes": [_episode(one) for one in history.episodes],
+        "Repairs": [
+            {
+                "At": one.at,
+                "Motor": one.motor,
+                "Part": one.part,
+                "Person": one.person,
+                "Note": one.note,
+            }
+            for one in history.repairs
+        ],
+    }
+
+
+def _episode(episode: FaultEpisode) -> Content:
+    return {
+        "Number": episode.number,
+        "Motor": episode.motor,
+        "Mode": episode.mode,
+        "State": episode.state,
+        "Since": episode.since,
+        "Until": episode.until,
+        "Findings": [
+            {
+                "At": one.at,
+                "Verdict": one.verdict,
+                "Cause": one.cause,
+                "Person": one.person,
+                "Note": one.note,
+                "WithdrawnWhen": one.withdrawn_when,
+            }
+            for one in episode.findings
+        ],
+    }
+
+
+# Elements of BaSyx.
+
+
+def _elements(content: Content, meanings: Mapping[str, str]) -> list[model.SubmodelElement]:
+    return [
+        _element(name, value, _meaning(meanings[name]) if name in meanings else None)
+        for name, value in content.items()
+        if value is not None
+    ]
+
+
+def _element(
+    name: str, value: Any, meaning: model.ExternalReference | None
+) -> model.SubmodelElement:
+    from basyx.aas import model
+
+    if isinstance(value, Mapping):
+        return model.SubmodelElementCollection(name, _elements(value, {}), semantic_id=meaning)
+    if isinstance(value, bytes):
+        return model.Blob(name, "application/toml", value, semantic_id=meaning)
+    if isinstance(value, list):
+        rows = [model.SubmodelElementCollection(None, _elements(row, {})) for row in value]
+        kind = model.SubmodelElementCollection
+        return model.SubmodelElementList(name, kind, rows, semantic_id=meaning)
+    if name == "ManufacturerProductDesignation":
+        text = model.MultiLanguageTextType({LANGUAGE: _text(value)})
+        return model.MultiLanguageProperty(name, text, semantic_id=meaning)
+    if name == "URIOfTheProduct":
+        uri = model.datatypes.AnyURI(value)
+        return model.Property(name, model.datatypes.AnyURI, uri, semantic_id=meaning)
+    if isinstance(value, str):
+        value = _text(value)
+    return model.Property(name, type(value), value, semantic_id=meaning)
+
+
+def _text(text: str) -> str:
+    return NOT_XML.sub("\ufffd", text)
+
+
+def _meaning(identifier: str) -> model.ExternalReference:
+    from basyx.aas import model
+
+    key = model.Key(model.KeyTypes.GLOBAL_REFERENCE, identifier)
+    return model.ExternalReference((key,))
