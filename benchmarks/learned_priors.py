@@ -30,8 +30,8 @@ from failuretwin.data_knowledge.records.log_files import LogFile
 from failuretwin.decision.scoring import log_score, log_score_gain
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import priors_of
-from failuretwin.inference.posterior import log_prior
 
 SPREAD = 1.0
 """Deviation of the logarithm of true rates about those of the table."""

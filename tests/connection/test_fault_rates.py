@@ -18,7 +18,7 @@ from failuretwin.connection.fault_rates import (
 )
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.data_knowledge.records.fleet import FleetFaults
-from failuretwin.inference.posterior import log_prior
+from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.together.fault_filter import RATES
 
 MOTORS = [f"motor_{k}" for k in range(1, 5)]

@@ -25,11 +25,11 @@ from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.engine import theta as engine_theta
 from failuretwin.inference.engine.registration import robot_evidence
 from failuretwin.inference.engine.theta import offsets_of
+from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.posterior import log_prior
 from failuretwin.inference.together import folder_posterior as folder
 from failuretwin.inference.together import habits, runs_together
 from failuretwin.inference.together.belief import mixed as moments_of

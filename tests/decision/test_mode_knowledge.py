@@ -8,7 +8,7 @@ from failuretwin.core.hypothesis import HEALTHY, UNKNOWN, Hypothesis
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.advice import advice_lines, next_steps
 from failuretwin.inference.explanation import plain_name
-from failuretwin.inference.posterior import prior_odds
+from failuretwin.inference.faults.prior_odds import prior_odds
 
 
 @pytest.mark.parametrize("mode", MODES.values(), ids=lambda mode: mode.mode)

@@ -24,11 +24,12 @@ from failuretwin.inference.engine.registration import (
     run_posterior,
     sensor_in_doubt,
 )
+from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.registered import registered_evidence
-from failuretwin.inference.posterior import compute_posterior, log_prior, marginal_likelihood_of
+from failuretwin.inference.posterior import compute_posterior, marginal_likelihood_of
 
 KNOWN = Imperfections("made up", "test", settling=replace(SETTLING, tail_dof=5.0))
 DOUBTED = replace(KNOWN, variation=DOUBT)

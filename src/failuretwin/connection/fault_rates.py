@@ -22,7 +22,7 @@ from scipy.stats import gamma
 from failuretwin.core.errors import counted
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
-from failuretwin.inference.posterior import prior_odds
+from failuretwin.inference.faults.prior_odds import shares_of_motors
 from failuretwin.inference.together.fault_filter import RATES
 
 if TYPE_CHECKING:
@@ -70,13 +70,9 @@ class FaultRate:
 
 def table_rates(hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
     """Return the rate of each single fault by the table [1/h]: a motor's, shared by its modes."""
-    single = [h.faults[0] for h in hypotheses if h.known and len(h.faults) == 1]
-    odds = {str(fault): prior_odds(Hypothesis((fault,))) for fault in single}
-    total: dict[str, float] = {}
-    for fault in single:
-        total[fault.motor] = total.get(fault.motor, 0.0) + odds[str(fault)]
     each_per_h = RATES.faults_per_1000_h / 1000.0
-    return {str(fault): each_per_h * odds[str(fault)] / total[fault.motor] for fault in single}
+    shares = zip(hypotheses, shares_of_motors(hypotheses).tolist(), strict=True)
+    return {str(h): each_per_h * share for h, share in shares if share > 0.0}
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ from failuretwin.digital_model.settling import poses_in_range
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.engine.theta import offsets_doubted
+from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
@@ -57,7 +58,6 @@ from failuretwin.inference.observation.registered import (
     TURN,
     registered,
 )
-from failuretwin.inference.posterior import log_prior
 from failuretwin.inference.set_ups.set_ups import FAR_OFF, FAULT_OF_EVERY_RUN
 from failuretwin.inference.together.fault_course import FaultCourse
 from failuretwin.inference.together.folder_posterior import (

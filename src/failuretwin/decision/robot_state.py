@@ -44,7 +44,7 @@ from failuretwin.inference.explanation import (
     plain_name,
     undecided_step,
 )
-from failuretwin.inference.posterior import log_prior
+from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.set_ups.set_ups import FAULT_OF_EVERY_RUN
 from failuretwin.inference.together.fault_course import FaultCourse
 

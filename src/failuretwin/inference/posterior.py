@@ -7,7 +7,6 @@ Section: docs/inference.md#posterior
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -45,6 +44,7 @@ from failuretwin.inference.faults.marginal import (
 )
 from failuretwin.inference.faults.missed_movements import missed_movements_likelihood
 from failuretwin.inference.faults.motor_residual import motor_residual
+from failuretwin.inference.faults.prior_odds import log_prior, prior_odds
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.faults.stuck import stuck_model
 from failuretwin.inference.faults.unknown import unknown_likelihood
@@ -60,9 +60,6 @@ from failuretwin.inference.set_ups.wrong_setup import NOWHERE, nowhere_near
 
 # From a hypothesis to what runs say of it.
 
-UNKNOWN_ODDS = 1.0
-"""Odds of `unknown` against healthy where nothing is seen; each explanation of what is seen has
-odds of its own in its evidence, none has more."""
 MOST_FAULTS = 2
 """Faults that can be weighed at once."""
 NOT_IN_PAIRS = (Signature.TRANSIENT, Signature.MISSED)
@@ -95,19 +92,6 @@ def shows_in_transients(hypothesis: Hypothesis) -> bool:
     return not hypothesis.known or any(
         MODES[fault.mode].signature is Signature.TRANSIENT for fault in hypothesis.faults
     )
-
-
-def prior_odds(hypothesis: Hypothesis) -> float:
-    """Return the odds of a hypothesis against healthy; faults of several motors multiply."""
-    return math.prod((MODES[fault.mode].prior_odds for fault in hypothesis.faults), start=1.0)
-
-
-def log_prior(hypotheses: Sequence[Hypothesis], priors: Priors) -> FloatArray:
-    """Return the log prior probability of each hypothesis, (hypothesis,)."""
-    odds = np.array([prior_odds(h) if h.known else UNKNOWN_ODDS for h in hypotheses])
-    odds *= [priors.factor_of(h) for h in hypotheses]
-    odds[[h.is_healthy for h in hypotheses]] *= priors.healthy_odds
-    return np.asarray(np.log(odds / odds.sum()))
 
 
 def marginal_likelihoods(

@@ -28,10 +28,10 @@ from failuretwin.inference.engine.registration import (
 )
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.engine.theta import offsets_doubted
+from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import highest_and_outlier
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
-from failuretwin.inference.posterior import log_prior
 from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp, with_doubt
 from failuretwin.inference.set_ups.log_correction import LogCorrection
 from failuretwin.inference.set_ups.set_ups import FEWEST_TO_TURN, SetUp, mistakes, turned, zero_off

@@ -32,10 +32,10 @@ from failuretwin.inference.engine.theta import (
     layout_of,
     robot_components,
 )
+from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.posterior import log_prior
 from failuretwin.inference.together.folder_posterior import folder_posterior
 from failuretwin.inference.together.habits import Habits
 

@@ -35,6 +35,7 @@ from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.engine.registration import run_posterior
 from failuretwin.inference.explanation import worded
+from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.log_quality import LogQuality
@@ -43,7 +44,6 @@ from failuretwin.inference.posterior import (
     Posterior,
     StreamPosition,
     compute_posterior,
-    log_prior,
     shows_in_transients,
 )
 

@@ -47,6 +47,7 @@ from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.engine.posterior import theta_posterior
 from failuretwin.inference.engine.registration import robot_weighing, run_posterior, sensor_in_doubt
 from failuretwin.inference.engine.runs import has_rows
+from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors, visible_sizes
 from failuretwin.inference.isolability import IsolabilityReport, isolability
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -54,7 +55,7 @@ from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.log_quality import BEYOND_USUAL, LogQuality
 from failuretwin.inference.observation.settings import ERROR_STEPS, WIDEST_ERROR
-from failuretwin.inference.posterior import Posterior, log_prior
+from failuretwin.inference.posterior import Posterior
 
 HEALTHY_TO_FAULTY = 2.0
 """Odds that an arm is healthy that nobody suspects; assumed."""

@@ -32,10 +32,11 @@ from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault
 from failuretwin.decision.streaming.monitor import Believed
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.observation.command_loss import OUTLIER_RATE
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.posterior import Posterior, log_prior
+from failuretwin.inference.posterior import Posterior
 
 SIZES = 3
 """Sizes of each fault that are laid beside each other."""

@@ -30,6 +30,7 @@ from failuretwin.inference.engine.rows import Scene
 from failuretwin.inference.engine.runs import RunsEvidence, has_rows
 from failuretwin.inference.engine.theta import Components, Layout
 from failuretwin.inference.faults.marginal import MarginalLikelihood
+from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import TransientSamples
@@ -39,7 +40,7 @@ from failuretwin.inference.observation.registered import (
     registered_evidence,
     registered_samples,
 )
-from failuretwin.inference.posterior import Posterior, log_prior, marginal_likelihoods
+from failuretwin.inference.posterior import Posterior, marginal_likelihoods
 from failuretwin.inference.set_ups.set_ups import odd_zero
 
 TOLD = 0.9

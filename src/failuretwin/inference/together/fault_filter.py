@@ -33,11 +33,12 @@ from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.faults.fault_models import redrawn_offset_model
 from failuretwin.inference.faults.fault_sizes import DENSE, SizePrior
 from failuretwin.inference.faults.marginal import movement_log_likelihoods
+from failuretwin.inference.faults.prior_odds import shares_of_motors
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.faults.stuck import held_prior, stuck_intervals
 from failuretwin.inference.movements.run_likelihood import HELD_BEYOND, RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.posterior import motor_of, prior_odds
+from failuretwin.inference.posterior import motor_of
 
 S_PER_H = 3600.0
 STEP = 0.5
@@ -261,11 +262,8 @@ class FaultFilter:
     @cached_property
     def _rate(self) -> FloatArray:
         """Rate of each hypothesis, (hypothesis,) [1/h]: a motor's, shared by the odds of modes."""
-        odds = np.array([0.0 if h.is_healthy else prior_odds(h) for h in self.hypotheses])
-        motors = ["" if h.is_healthy else h.faults[0].motor for h in self.hypotheses]
-        total = np.array([odds[[m == motor for m in motors]].sum() for motor in motors])
-        learned = odds * [self.priors.factor_of(h) for h in self.hypotheses]
-        return self.rates.faults_per_1000_h / 1000.0 * learned / np.maximum(total, LEAST)
+        learned = [self.priors.factor_of(h) for h in self.hypotheses]
+        return self.rates.faults_per_1000_h / 1000.0 * shares_of_motors(self.hypotheses) * learned
 
     @cached_property
     def _grids(self) -> list[FloatArray]:
