@@ -142,7 +142,7 @@ def test_the_calibration_of_the_store_is_used_where_none_is_named(
 def test_questions_and_exports(run, store, tmp_path):
     listed = run("query")
     assert listed.splitlines()[0] == "failing-motors          Which motors fail most?"
-    assert run("query", "failing-motors", *store) == "Which motors fail most? None.\n"
+    assert run("query", "failing-motors", *store) == "Which motors fail most?\nnone\n"
     run("diagnose", SAMPLE, *store, *AT)
     assert "motor_2  steady_state_error  1" in run("query", "failing-motors", *store)
     assert "open fault" in run("query", "due", "--days", 1, *store)

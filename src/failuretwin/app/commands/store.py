@@ -276,4 +276,4 @@ def query(name: str | None, days: float, store: str | None) -> None:
             tell(f"{question:24}{asked.title}")
         return
     answer = ft.open_store(_url(store)).query(name, days)
-    show(query_table(answer) if answer.rows else f"{answer.title} None.")
+    show(query_table(answer) if answer.rows else f"{answer.title}\nnone")
