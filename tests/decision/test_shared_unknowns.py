@@ -13,6 +13,7 @@ from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.engine.registration import displaced_components
 from failuretwin.inference.engine.theta import (
+    AS_TOLD,
     KNOWN,
     Layout,
     columns,
@@ -183,7 +184,7 @@ PLAIN = Layout(4, geometry=False)
 
 def believed(model, prior):
     """Return what is believed of a robot whose sensor may be displaced, and how wide it is."""
-    usual = robot_components(model, PLAIN, factors=False)
+    usual = robot_components(model, PLAIN, AS_TOLD)
     found = displaced_components(model, prior, PLAIN, usual)
     variance = np.diagonal(found.covariance, axis1=1, axis2=2)
     return found, np.sqrt(variance)[found.normal]

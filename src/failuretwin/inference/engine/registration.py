@@ -55,7 +55,7 @@ def robot_weighing(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> Weighing:
     """Return runs of a robot whose sensor is where the profile says."""
-    layout, components = _usual(likelihood)
+    layout, components = _usual(likelihood, priors.setup)
     place = np.zeros((len(likelihood.usable), REGISTRATION))
     return Weighing(likelihood, hypotheses, priors, layout, components, place)
 
@@ -64,7 +64,7 @@ def displaced_weighing(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors, place: FloatArray
 ) -> Weighing:
     """Return runs of a robot whose sensor may be displaced, each about a registration (run, 7)."""
-    layout, usual = _usual(likelihood)
+    layout, usual = _usual(likelihood, priors.setup)
     components = displaced_components(likelihood.model, priors.setup, layout, usual)
     components = components.about(np.pad(place, ((0, 0), (0, layout.size - REGISTRATION))))
     if place.any():  # rows are chosen by a sensor that stands right there
@@ -73,17 +73,22 @@ def displaced_weighing(
     return Weighing(likelihood, hypotheses, priors, layout, components, place)
 
 
-def _usual(likelihood: RunLikelihood) -> tuple[Layout, Components]:
+def _usual(likelihood: RunLikelihood, setup: SetupPrior) -> tuple[Layout, Components]:
     model = likelihood.model
     layout = layout_of(model.without_doubt, bool(likelihood.evidence.on_the_way.any()))
-    return layout, robot_components(model, layout, _factors(model))
+    return layout, robot_components(model, layout, _factors(model, setup))
 
 
-def _factors(model: HealthyModel) -> ScaleFactors:
-    """Return what is unknown of scatter and noise; nothing of a robot said to be ideal."""
+def _factors(model: HealthyModel, setup: SetupPrior) -> ScaleFactors:
+    """Return what is unknown of scatter and noise.
+
+    Nothing of a robot that is said to be ideal, or surely the one of its calibration and unchanged.
+    """
     if model.scatter_factor != 1.0 or model.imperfections.settling is None:
         return AS_TOLD
-    return OF_CLASS if model.imperfections.of_class else SINCE_CALIBRATED
+    if model.imperfections.of_class:
+        return OF_CLASS
+    return SINCE_CALIBRATED if setup.another_rate > 0.0 else AS_TOLD
 
 
 def displaced_components(
@@ -131,7 +136,7 @@ def _about(
 ) -> Weighing:
     """Return runs about some registrations, with a broad prior of it and extra noise."""
     model = likelihood.model
-    layout, usual = _usual(likelihood)
+    layout, usual = _usual(likelihood, priors.setup)
     frames = displaced_components(model, priors.setup, layout, usual)
     noise = float(np.hypot(model.path_noise, share * model.twin.robot.reach))
     ranked = [h for h in hypotheses if has_rows(h)]
@@ -202,7 +207,7 @@ def _suspect(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors, best: IntArray
 ) -> bool:
     """Return whether the sensor may be displaced, by the most probable hypothesis of each run."""
-    layout, usual = _usual(likelihood)
+    layout, usual = _usual(likelihood, priors.setup)
     size, narrow = layout.size, usual.first
     information, shift = np.zeros((len(best), size, size)), np.zeros((len(best), size))
     ill: BoolArray = np.zeros(len(best), dtype=bool)
