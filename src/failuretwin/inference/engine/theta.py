@@ -276,7 +276,9 @@ OF_CLASS = ScaleFactors(
     {0.1: 0.2, 0.3: 0.15, 1.0: 0.5, 3.0: 0.1, 8.0: 0.05},
 )
 """Of robots that nobody has calibrated; assumed, heavy above 1."""
-SINCE_CALIBRATED = ScaleFactors({1.0: 0.72, 1.6: 0.14, 2.5: 0.1, 4.0: 0.04}, {1.0: 1.0})
+SINCE_CALIBRATED = ScaleFactors(
+    {1.0: 0.72, 1.6: 0.14, 2.5: 0.1, 4.0: 0.04}, {1.0: 0.92, 3.0: 0.05, 8.0: 0.03}
+)
 """Of calibrated robots, which wear, work at other speeds or stand elsewhere since; assumed."""
 
 
