@@ -192,7 +192,10 @@ def test_an_accelerometer_alone_cannot_tell_what_gravity_does_not_show(runs):
 
 
 def test_a_constant_error_that_is_allowed_for_is_no_fault():
-    """0.4 m/s2 on the accelerometer, two degrees: told as a doubt, or not."""
+    """0.4 m/s2 on the accelerometer, two degrees: told as a doubt, or not.
+
+    Untold it counts as a noisy sensor in part.
+    """
     known = load_calibration("armpi_fpv", ft.load_robot("armpi_fpv")).imperfections
     off = SensorProfile("accelerometer", bias=(0.0, 0.4, 0.0), doubt=0.0)
     hypotheses = ["healthy", "motor_2:steady_state_error"]
@@ -209,7 +212,7 @@ def test_a_constant_error_that_is_allowed_for_is_no_fault():
         model = replace(known, sensors=(told,))
         one = BayesDiagnoser("armpi_fpv", model, hypotheses, sensing="accelerometer")
         healthy[doubt] = [d.posterior["healthy"] for d in one.diagnose(seen)]
-    assert np.mean(healthy[0.0][:6]) < 0.5
+    assert np.mean(healthy[0.0][:6]) < 0.6
     assert np.mean(healthy[0.3][:6]) > 0.7
     assert np.mean(healthy[0.3][6:]) < 0.3
 
