@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import logging
 import os
 import signal
 from pathlib import Path
@@ -129,3 +130,19 @@ def place(request, tmp_path):
     if request.param == "sqlite":
         return SqlitePlace(tmp_path / "robots.db")
     return request.getfixturevalue("postgres").place()
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    """Address of a scheduler with two workers."""
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        host="127.0.0.1",
+        memory_limit=0,
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
+    ) as cluster:
+        yield cluster.scheduler_address

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import shutil
 import signal
 import subprocess
@@ -78,22 +77,6 @@ def zarr(runs, tmp_path_factory):
     path = tmp_path_factory.mktemp("zarr") / "runs.zarr"
     save_run_set(runs, path)
     return path
-
-
-@pytest.fixture(scope="module")
-def scheduler():
-    """Address of a scheduler with two workers."""
-    from distributed import LocalCluster
-
-    with LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        host="127.0.0.1",
-        memory_limit=0,
-        dashboard_address="127.0.0.1:0",
-        silence_logs=logging.CRITICAL,
-    ) as cluster:
-        yield cluster.scheduler_address
 
 
 def pieces_of(*paths):
