@@ -21,11 +21,11 @@ def posteriors(diagnoses):
 
 def decided(diagnoser, runs):
     """Return the posteriors of the batch."""
-    return posteriors(batch(diagnoser).diagnose(runs))
+    return posteriors(of_named(diagnoser).diagnose(runs))
 
 
-def batch(diagnoser):
-    """Return the same for recorded runs: like a stream, it takes the robot for the named one."""
+def of_named(diagnoser):
+    """Return a diagnoser that is told what a stream takes for granted: the robot is the named."""
     named = dataclasses.replace(diagnoser.priors.setup, another_rate=0.0)
     priors = dataclasses.replace(diagnoser.priors, setup=named)
     return BayesDiagnoser(
@@ -41,7 +41,7 @@ def play(runs, diagnoser, robots=slice(None), order=None, skip=()):
     """Return a fleet that has seen the runs, in some order of the samples."""
     time, command = runs["time"].values, runs["command"].values[robots]
     measured = runs["measured"].values[robots]
-    fleet = StreamingFleet(diagnoser, len(command), runs.attrs["measured_rate_hz"])
+    fleet = StreamingFleet(of_named(diagnoser), len(command), runs.attrs["measured_rate_hz"])
     for i in range(len(time)) if order is None else order:
         if i not in skip:
             fleet.update(time[i], command[:, i], measured[:, i])
@@ -65,7 +65,7 @@ def played(nine_runs, live_diagnoser):
 
 def test_the_end_of_a_stream_is_the_batch(nine_runs, live_diagnoser, played):
     fleet, _ = played
-    expected = batch(live_diagnoser).diagnose(nine_runs)
+    expected = of_named(live_diagnoser).diagnose(nine_runs)
     np.testing.assert_allclose(fleet.posterior, posteriors(expected), rtol=0.0, atol=1e-9)
     for robot, diagnosis in enumerate(expected):
         said = fleet.diagnosis(robot)
@@ -104,7 +104,7 @@ def test_samples_may_come_late(nine_runs, live_diagnoser, rng):
     # What is told late of commands is not taken up, so only readings are late here.
     time, command = some["time"].values, some["command"].values
     measured = some["measured"].values
-    fleet = StreamingFleet(settled, 9, some.attrs["measured_rate_hz"])
+    fleet = StreamingFleet(of_named(settled), 9, some.attrs["measured_rate_hz"])
     for now, i in enumerate(order):
         fleet.update(time[now], command[:, now], None)
         fleet.update(time[i], None, measured[:, i])
@@ -170,7 +170,7 @@ def test_five_hundred_runs_as_streams(armpi, twin, rng):
     # Readings arrive up to 0.3 s late, out of order.
     time, command, measured = (runs[name].values for name in ("time", "command", "measured"))
     order = np.argsort(np.arange(len(time)) + rng.integers(0, 30, len(time)), kind="stable")
-    fleet = StreamingFleet(diagnoser, 500, runs.attrs["measured_rate_hz"])
+    fleet = StreamingFleet(of_named(diagnoser), 500, runs.attrs["measured_rate_hz"])
     for now, i in enumerate(order):
         fleet.update(time[now], command[:, now], None)
         fleet.update(time[i], None, measured[:, i])

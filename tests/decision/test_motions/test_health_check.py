@@ -208,7 +208,7 @@ def test_the_next_movement_settles_what_is_open(model, gate, designed):
 def test_further_movements_are_made_while_it_is_open(known, gate, designed):
     pytest.importorskip("mujoco")
     fault = ScheduledFault(Hypothesis.parse("motor_4:steady_state_error").faults[0], 0.0)
-    modes = dict(MODES) | {"steady_state_error": SteadyStateError(magnitude=(0.02, 0.02))}
+    modes = dict(MODES) | {"steady_state_error": SteadyStateError(magnitude=(0.025, 0.025))}
     emulation = (known, gate, designed[:3], (fault,), modes)
     result = carried_out(*emulation, further=2)
     assert result.further == result.movements - 3
