@@ -1,14 +1,14 @@
 """Arms that never rest: every run a continuous motion, simulated, nothing known of the robot.
 
     python benchmarks/never_at_rest.py [--robot armpi_fpv ur5e so101 panda] [--motion blended ...]
-        [--rate 10] [--calibration generic] [--healthy 20] [--faulty 3] [--clock 0.0]
+        [--rate 10] [--calibration generic] [--healthy 20] [--faulty 3] [--clock 0.0] [--folder]
     python benchmarks/never_at_rest.py --logs FOLDER [--share 0.85] [--calibration armpi_fpv]
 
 Five motions, ten seconds each: point to point without a stop, sinusoids, splines as of a leader
-arm, set points at 125 Hz, pick and place in a loop. Each run is of another robot, drawn from what
-its class is like: bias, sag, friction, lag; scatter wanders within a second or so. A motor gets
-stuck at any time, or is off by two to four times what can be seen of it: by another error after
-each stroke, or, on curves, by one that comes in mid-run.
+arm, set points at 125 Hz, pick and place in a loop. Each run is of another robot (with `--folder`
+all are of one), drawn from what its class is like: bias, sag, friction, lag; scatter wanders within
+a second or so. A motor gets stuck at any time, or is off by two to four times what can be seen of
+it: by another error after each stroke, or, on curves, by one that comes in mid-run.
 """
 
 from __future__ import annotations
@@ -144,15 +144,34 @@ def cases(robot: Robot, healthy: int, faulty: int, seed: int) -> Iterator[Case]:
                 yield Case(mode, motor, seed + 1000 * (motor + 1) + n)
 
 
-def simulated(robot: Robot, motion: Path, case: Case, rate: float, late: float) -> RunTable:
-    """Return one run of a robot of its own."""
+@dataclass(frozen=True)
+class Arm:
+    """What one robot is like: where its motors settle, how far they trail their commands [s]."""
+
+    settling: Settling
+    compliance: FloatArray
+    delay_s: float
+    lag_s: float
+
+    @classmethod
+    def drawn(cls, robot: Robot, rng: np.random.Generator) -> Arm:
+        """Return a robot drawn from what its class is like."""
+        usual, motors = generic_imperfections(robot), len(robot.motors)
+        settling = vary(usual, rng).settling or Settling.ideal(motors)
+        stiffness = np.exp(STIFFNESS * rng.standard_normal(motors))
+        compliance = np.asarray((usual.settling or settling).compliance) * stiffness
+        return cls(settling, compliance, rng.uniform(*DELAY_S), rng.uniform(*LAG_S))
+
+
+def simulated(
+    robot: Robot, motion: Path, case: Case, rate: float, late: float, arm: Arm | None = None
+) -> RunTable:
+    """Return one run of an arm; None: of one of its own."""
     rng = np.random.default_rng([case.seed, len(robot.motors)])
     time = as_floats(STEP_S * np.arange(round(DURATION_S / STEP_S) + 1))
     (command, strokes), motors = motion(robot, time, rng), len(robot.motors)
-    usual = generic_imperfections(robot)
-    settling = vary(usual, rng).settling or Settling.ideal(motors)
-    stiffness = np.exp(STIFFNESS * rng.standard_normal(motors))
-    compliance = np.asarray((usual.settling or settling).compliance) * stiffness
+    usual, arm = generic_imperfections(robot), arm or Arm.drawn(robot, rng)
+    settling = arm.settling
     knots = np.arange(0.0, DURATION_S + 2.0 * WANDER_S, WANDER_S)
     scatter = CubicSpline(knots, rng.standard_normal((len(knots), motors)))(time)
     scatter *= np.asarray(settling.scatter)
@@ -162,16 +181,15 @@ def simulated(robot: Robot, motion: Path, case: Case, rate: float, late: float) 
         onset = 0.0 if len(strokes) else rng.uniform(0.2, 0.5) * DURATION_S
         error[:, case.motor] = _errors(time, strokes, onset, rng) * model.least_visible[case.motor]
     speed = np.gradient(command, STEP_S, axis=0)
-    friction = np.asarray(settling.friction) * np.tanh(speed / 0.02)
+    friction = np.asarray(settling.friction) * _direction(speed)
     wanted = command + np.asarray(settling.bias) - friction + scatter + error
-    delay = rng.uniform(*DELAY_S)
-    wanted = np.stack([np.interp(time - delay, time, one) for one in wanted.T], axis=-1)
-    wanted = first_order_lag(wanted.T, wanted[0], STEP_S, rng.uniform(*LAG_S)).T
+    wanted = np.stack([np.interp(time - arm.delay_s, time, one) for one in wanted.T], axis=-1)
+    wanted = first_order_lag(wanted.T, wanted[0], STEP_S, arm.lag_s).T
     held = np.zeros((1, len(time), motors), dtype=bool)
     if case.fault == "stuck":
         onset = rng.uniform(0.0, 0.7 * DURATION_S)
         held[0, time >= onset, case.motor] = True
-    drive = Drive(wanted[None], held, compliance=compliance[None])
+    drive = Drive(wanted[None], held, compliance=arm.compliance[None])
     position = ServoEngine(robot).angles(drive, time)[0]
     name = "healthy" if case.motor < 0 else f"{robot.motor_names[case.motor]}:{case.fault}"
     return RunTable(
@@ -186,6 +204,13 @@ def simulated(robot: Robot, motion: Path, case: Case, rate: float, late: float) 
         ),
         attributes={"robot": robot.name, "source": "simulated"},
     )
+
+
+def _direction(speed: FloatArray) -> FloatArray:
+    """Return the sign of the last travel of each motor, smooth where it turns, (time, motor)."""
+    smooth = np.tanh(speed / 0.02)
+    at = np.where(speed != 0.0, np.arange(len(speed))[:, None], 0)
+    return np.take_along_axis(smooth, np.maximum.accumulate(at, axis=0), axis=0)
 
 
 def _errors(
@@ -271,6 +296,7 @@ def main() -> None:
     parser.add_argument("--faulty", type=int, default=3)
     parser.add_argument("--clock", type=float, default=0.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--folder", action="store_true", help="one robot, judged together")
     parser.add_argument("--logs")
     parser.add_argument("--share", type=float)
     given = parser.parse_args()
@@ -281,10 +307,15 @@ def main() -> None:
         robot = load_robot(name)
         for motion in given.motion:
             some = list(cases(robot, given.healthy, given.faulty, given.seed))
-            tables = [simulated(robot, MOTIONS[motion], c, given.rate, given.clock) for c in some]
+            arm = Arm.drawn(robot, np.random.default_rng(given.seed)) if given.folder else None
+            sensed = given.rate, given.clock, arm
+            tables = [simulated(robot, MOTIONS[motion], c, *sensed) for c in some]
             runs = concatenate([table.to_dataset() for table in tables])
             began = clock.process_time()
-            found = ft.diagnose(runs, robot, given.calibration)
+            if given.folder:
+                found = ft.SelfCalibratingDiagnoser(robot).diagnose(runs)
+            else:
+                found = ft.diagnose(runs, robot, given.calibration)
             print(f"{name} {motion}: {line(found, clock.process_time() - began)}", flush=True)
 
 

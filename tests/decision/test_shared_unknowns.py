@@ -16,6 +16,7 @@ from failuretwin.inference.engine.theta import (
     AS_TOLD,
     KNOWN,
     Layout,
+    Motion,
     columns,
     loads,
     offset_deviation,
@@ -75,7 +76,8 @@ def differences(model, base, direction, step=1e-5):
 
 def found_columns(model, base, direction):
     pose = model.settle(base, direction, np.zeros(4, dtype=bool))
-    return columns(model, pose, direction, np.zeros_like(pose), Layout(4, geometry=False))
+    still = np.zeros_like(pose)
+    return columns(model, pose, Motion(direction, still, still), Layout(4, geometry=False))
 
 
 def test_columns_are_the_derivative_of_where_the_tool_is_seen(twin):
@@ -110,11 +112,12 @@ def test_a_motor_gives_way_by_its_load_in_the_logs_sense(twin):
 
 def test_layout_of_theta():
     plain, whole = Layout(4, geometry=False), Layout(4, geometry=True, moving=True)
-    assert (plain.size, whole.size) == (19, 47)
+    assert (plain.size, whole.size) == (19, 48)
     assert [plain.own(motor) for motor in (0, 3)] == [[7, 11, 15], [10, 14, 18]]
     assert (whole.offsets, whole.frames, whole.lags) == (slice(7, 19), slice(19, 43), slice(43, 47))
-    place = whole.place(np.ones(47))
-    assert (place[:19].sum(), place[19:].sum()) == (19.0, 0.0)  # frames and lags stay linear
+    assert whole.bend == slice(47, 48)
+    place = whole.place(np.ones(48))
+    assert (place[:19].sum(), place[19:].sum()) == (19.0, 0.0)  # frames, lags and bends stay linear
 
 
 def test_offsets_are_added_to_those_that_are_known():

@@ -51,6 +51,7 @@ from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.on_the_way import likeliest_lag, on_the_way
 from failuretwin.inference.observation.registered import (
     ORIGIN,
     REGISTRATION,
@@ -174,7 +175,7 @@ class SelfCalibratingDiagnoser:
         bayes = BayesDiagnoser(self.twin, believed, self.hypotheses, self.priors)
         model = bayes.healthy_model
         seen = Evidence(runs, model.settings)
-        evidence = seen.sound.settled
+        evidence = on_the_way(seen.sound, model, likeliest_lag(seen.sound, model))
         likelihood = RunLikelihood(evidence, model)
         found = folder_posterior(likelihood, bayes.hypothesis_set, bayes.priors, advance)
         names, truth = [str(name) for name in runs["run"].values], truths_of(runs)
@@ -183,7 +184,11 @@ class SelfCalibratingDiagnoser:
             posterior.to_diagnosis(at, names[run], seen.quality[run], truth[run])
             for run, (posterior, at) in enumerate(judged)
         ]
-        diagnoses = [replace(one, protocol="P1", method=_method(robot)) for one in told]
+        way = evidence.on_the_way
+        diagnoses = [
+            replace(one, protocol="P1", method=_method(robot, bool(way[run])))
+            for run, one in enumerate(told)
+        ]
         learned = as_calibration(found, believed, robot, runs)
         prior = np.exp(log_prior(bayes.hypothesis_set, bayes.priors))
         return SelfCalibration(diagnoses, learned, prior, found.taught)
@@ -205,8 +210,9 @@ def learned_name(robot: Robot) -> str:
     return f"{robot.name}, self-calibrated"
 
 
-def _method(robot: Robot) -> str:
-    return f"bayes, settled poses; healthy behaviour: {learned_name(robot)}"
+def _method(robot: Robot, on_the_way: bool) -> str:
+    used = "readings on the way" if on_the_way else "settled poses"
+    return f"bayes, {used}; healthy behaviour: {learned_name(robot)}"
 
 
 def check_moves(movements: Movements) -> None:

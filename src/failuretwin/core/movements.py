@@ -116,7 +116,8 @@ class Stretches(Movements):
     Attributes:
         beginning: Reference at the start of each, (run, movement, motor) [rad].
         speed: Of the reference at the reading, (run, movement, motor) [rad/s]; 0 at rest.
-        bend: What a lag leaves of an acceleration there, (run, movement, motor) [rad].
+        bend: Half its acceleration there times the square of a usual lag, (run, movement, motor)
+            [rad].
         done: Share of the movement that each motor had made, (run, movement, motor).
         at_rest: Whether the reading is at rest, (run, movement).
         whole: Whether a stretch is all that is seen of its movement, (run, movement).

@@ -25,7 +25,7 @@ from failuretwin.inference.misfit import FITS, run_misfit
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.observation.on_the_way import on_the_way
+from failuretwin.inference.observation.on_the_way import likeliest_lag, on_the_way
 from failuretwin.inference.observation.rounding import (
     Rounding,
     command_rounding,
@@ -93,7 +93,14 @@ class SeenRuns:
         sound = self.evidence.sound
         if not sound.settled.usable.shape[1]:
             return sound.settled.padded(1)
-        return on_the_way(sound, self.model) if self.whole_run else sound.settled
+        if not self.whole_run:
+            return sound.settled
+        return on_the_way(sound, self.model, self._judges.lag_s)
+
+    @cached_property
+    def lag_s(self) -> float:
+        """How far the tool trails its commands in runs that hardly rest [s]."""
+        return likeliest_lag(self.evidence.sound, self.model)
 
     @cached_property
     def healthy(self) -> HealthyModel:

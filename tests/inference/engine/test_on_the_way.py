@@ -7,13 +7,14 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import failuretwin as ft
+from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Stretches
 from failuretwin.core.runs import RunTable, concatenate, truth_of
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.digital_model.nonidealities import Schedule
+from failuretwin.digital_model.nonidealities import Schedule, Variation
 from failuretwin.digital_model.robot import load_robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.random_movements import RandomMovements
@@ -23,11 +24,12 @@ from failuretwin.inference.engine.registration import robot_weighing
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.observation.on_the_way import SHARE, on_the_way
+from failuretwin.inference.observation.on_the_way import SHARE, likeliest_lag, on_the_way
 
 ROBOT = load_robot("armpi_fpv")
 STEP_S = 0.01
 WITHOUT_REST = RandomMovements(count=6, period_s=1.2, ramp_shares=(1.0,))
+LONG = replace(WITHOUT_REST, count=8)
 
 
 def exact_run(command, late_s):
@@ -73,7 +75,7 @@ def moments(runs):
     """The run as the engine sees it."""
     healthy = model()
     evidence = Evidence(runs, healthy.settings, healthy.sensors).sound
-    return healthy, on_the_way(evidence, healthy)
+    return healthy, on_the_way(evidence, healthy, healthy.lag_s)
 
 
 def test_stretches_of_ramps_are_those_of_the_command():
@@ -141,6 +143,71 @@ def test_the_lag_is_found_and_is_no_fault(more_s):
     assert weighing.posterior().log_posterior[0].argmax() == 0
 
 
+def followed(command, constant_s):
+    """What a first-order lag makes of a command, exactly between samples."""
+    kept, found = np.exp(-STEP_S / constant_s), [command[0]]
+    for told in command[1:]:
+        found.append(kept * found[-1] + (1.0 - kept) * told)
+    return np.array(found)
+
+
+def test_the_bend_of_a_first_order_lag_is_found():
+    """x = q(t - T) + T^2 qdd / 2: all of a bend whose time constant is 0.05 s, not half of it."""
+    command = curve()
+    runs = exact_run(followed(command, 0.05), 0.0).assign(
+        command=(("run", "time", "motor"), command[None])
+    )
+    healthy = model()
+    evidence = Evidence(runs, healthy.settings, healthy.sensors).sound
+    seen = on_the_way(evidence, healthy, 0.05)
+    pose = seen.movements.target[0] + seen.movements.bend[0]
+    bent, straight = (
+        np.abs(seen.point[0] - healthy.sensors.expected(q)[0])[seen.usable[0]]
+        for q in (pose, seen.movements.target[0])
+    )
+    assert bent.max() < 0.0016  # as without a lag
+    assert bent.mean() < 0.75 * straight.mean()
+    weighing = robot_weighing(RunLikelihood(seen, healthy), [ft.Hypothesis(())], ft.Priors())
+    mean, covariance = theta_posterior(weighing.evidence)
+    at = weighing.layout.bend.start
+    assert abs(mean[0, at] - 0.5) < 2.0 * np.sqrt(covariance[0, at, at])
+    assert mean[0, at] > 0.0
+
+
+@pytest.mark.parametrize("late_s", [-0.4, -0.1, 0.0, 0.07, 0.3])
+def test_clocks_that_are_apart_are_found(late_s):
+    """Beside the mean lag; friction, which this arm has none of, is taken for 0.01 s of it."""
+    healthy = model()
+    late = healthy.lag_s + late_s
+    command = curve()
+    if late < 0.0:  # a clock that is ahead: the command is told later
+        runs = exact_run(command, 0.0)
+        told = np.stack(
+            [
+                np.interp(
+                    STEP_S * np.arange(len(command)) + late, STEP_S * np.arange(len(command)), q
+                )
+                for q in command.T
+            ],
+            axis=-1,
+        )
+        runs = runs.assign(command=(("run", "time", "motor"), told[None]))
+    else:
+        runs = exact_run(command, late)
+    evidence = Evidence(runs, healthy.settings, healthy.sensors).sound
+    found = likeliest_lag(evidence, healthy) - healthy.lag_s
+    assert found == pytest.approx(late_s, abs=0.016)
+
+
+def test_friction_acts_against_the_motion_of_the_moment():
+    """Not against the travel since the moment before: a curve turns between."""
+    healthy, seen = moments(exact_run(curve(), 0.0))
+    found = moments_of(healthy.without_doubt, seen)
+    speed = found.speed[0, :, 0]
+    np.testing.assert_array_equal(found.direction[0, :, 0], np.sign(speed))
+    assert (np.sign(speed) != np.sign(found.target[0] - found.origin[0])).any()
+
+
 @pytest.fixture(scope="module")
 def never_at_rest():
     schedule = Schedule(period_s=(1.2, 1.2))
@@ -162,6 +229,30 @@ def test_runs_without_a_rest_are_diagnosed(never_at_rest):
     sure = np.array([max(d.posterior.values()) for d in found])
     assert not ((sure > 0.99) & ~right).any()
     assert not ((sure > 0.95) & ~right & (truth == "healthy")).any()
+
+
+LABELS = ["fault", "fault_detail", "onset", "magnitude"]
+BIAS = (0.025, -0.03, 0.02, -0.035)
+
+
+def test_arms_that_never_rest_are_calibrated():
+    """The zeros of the simulated robot lie in their intervals, and a stuck run teaches nothing."""
+    usual = generic_imperfections(ROBOT)
+    own = replace(usual.settling, bias=BIAS)
+    known = replace(
+        usual, settling=own, variation=Variation(), schedule=Schedule(period_s=(1.2, 1.2))
+    )
+    runs = simulate(
+        Plan(ROBOT, ["healthy"], runs_per_class=6, seed=4, imperfections=known, movements=LONG)
+    )
+    stuck = simulate(Plan(ROBOT, ["motor_3:stuck"], 1, seed=4, imperfections=known, movements=LONG))
+    found = calibrate(concatenate([runs, stuck]).drop_vars(LABELS), ROBOT, name="moving")
+    assert found.imperfections.name == "moving"
+    assert "never rests" in found.remarks[0]
+    told = [p for p in found.parameters if p.name == "bias"]
+    for parameter, truth in zip(told, BIAS, strict=True):
+        assert parameter.low < truth < parameter.high
+        assert parameter.high - parameter.low < 0.04  # before any run 0.07
 
 
 def test_who_leaves_the_way_aside_cannot_tell(never_at_rest):

@@ -51,15 +51,18 @@ from failuretwin.connection.calibration.timing_fit import (
     movements_of,
     transients,
 )
+from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
-from failuretwin.digital_model.arm_classes import class_of
+from failuretwin.digital_model.arm_classes import class_of, generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.robot import Robot, load_robot, shown_unit
 from failuretwin.inference.isolability import fault_probabilities
+from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.on_the_way import hardly_rest
 from failuretwin.inference.observation.sensors import TOOL_ALONE, sensing_of
 
 if TYPE_CHECKING:
@@ -257,6 +260,8 @@ def calibrate(
     runs, labelled = _without_faulty_labels(runs)
     if sensing_of(runs, None) != TOOL_ALONE:
         return replace(_of_sensors_alone(runs, robot, name, source), left_out=labelled)
+    if hold_out is None and _never_rests(runs, robot):
+        return replace(_of_the_way(runs, robot, name, source), left_out=labelled)
     inside = _held_out_runs(runs, hold_out)
     learning = runs.isel(run=np.flatnonzero(~inside))
     first = fit_calibration(learning, robot, name, source, thorough=False)
@@ -303,6 +308,32 @@ def _of_sensors_alone(runs: xr.Dataset, robot: Robot, name: str, source: str) ->
     count = max(fit.movements for fit in fits)
     plain = Calibration(motors, (), sessions, runs.sizes["run"], count, False, remarks=(remark,))
     return _with_sensors(plain, fits)
+
+
+def _never_rests(runs: xr.Dataset, robot: Robot) -> bool:
+    """Return whether most of the runs are judged by readings on the way."""
+    model = HealthyModel.of(robot, generic_imperfections(robot))
+    return bool(hardly_rest(Evidence(runs, model.settings).sound, model).mean() > 0.5)
+
+
+def _of_the_way(runs: xr.Dataset, robot: Robot, name: str, source: str) -> Calibration:
+    """Return a calibration by readings on the way, of an arm that never rests.
+
+    It is the posterior of what arms of the class are like (`SelfCalibratingDiagnoser`); runs that
+    look faulty teach it little.
+
+    Raises:
+        InputError: If many of the runs look faulty.
+    """
+    found = SelfCalibratingDiagnoser(robot).learn(runs)
+    _refuse_suspects(runs, np.array([1.0 - d.posterior["healthy"] for d in found.diagnoses]))
+    learned = replace(found.calibration.imperfections, name=name, source=source, protocol="P0c")
+    remark = (
+        "the arm never rests in these logs: it was calibrated by readings on the way, from what "
+        "arms of its class are like"
+    )
+    remarks = (remark, *found.calibration.remarks)
+    return replace(found.calibration, imperfections=learned, remarks=remarks)
 
 
 def _without_faulty_labels(runs: xr.Dataset) -> tuple[xr.Dataset, tuple[LeftOut, ...]]:

@@ -24,7 +24,7 @@ from failuretwin.inference.engine import symmetric
 from failuretwin.inference.engine.outcomes import Outcomes
 from failuretwin.inference.engine.rows import AmountPrior, Rows, Scene, before_onset, sampled
 from failuretwin.inference.engine.symmetric import packed, unpacked
-from failuretwin.inference.engine.theta import columns
+from failuretwin.inference.engine.theta import Motion, columns
 from failuretwin.inference.faults.fault_sizes import SizePrior, coarse_sizes
 from failuretwin.inference.faults.priors import OnsetIntervals, plateau_or_ramp
 
@@ -216,13 +216,13 @@ class _Motor:
         direction = np.broadcast_to(moments.direction[:, None], base.shape)
         held = (np.arange(base.shape[-1]) == motor) & self.held
         pose = scene.model.settle(base, direction, held)
-        speed, late = (
+        speed, bend, late = (
             np.broadcast_to(np.where(held, 0.0, values[:, None]), pose.shape)
-            for values in (moments.speed, moments.late)
+            for values in (moments.speed, moments.bend, moments.late)
         )
         spread, beside = np.swapaxes(pose, 1, 2), np.swapaxes(late, 1, 2)
         outcomes = Outcomes.of_poses(scene.model, moments, spread, self.variance, beside)
-        G = columns(scene.model, pose, direction, speed, scene.layout)
+        G = columns(scene.model, pose, Motion(direction, speed, bend), scene.layout)
         jacobian = scene.model.sensors.expected(pose[:, :, :, 0])[1]
         if self.held:
             G[..., scene.layout.own(motor)] = 0.0

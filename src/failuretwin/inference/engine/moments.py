@@ -23,6 +23,9 @@ LATE_RATE = 0.02
 controller that thinks; assumed."""
 KEPT_ON_CURVES = 0.7
 """Probability that an error on a curve stays what it is until the next moment; assumed."""
+BEND, OWN_BEND = 0.5, 0.3
+"""Share of `Stretches.bend` by which motors are off, in the mean, and the deviation of each from
+what they share; assumed."""
 MOST_OUTCOMES = 12
 """Outcomes of a movement that are weighed: the most probable ones."""
 
@@ -40,11 +43,12 @@ class Moments:
         ramp: Duration of its ramps, (run, moment, motor) [s].
         time: When the moment is, (run, moment) [s].
         base: Angles that the motors go for under each outcome, (run, moment, outcome, motor) [rad].
-        direction: Sign of their last travel, same axes.
+        direction: Sign of their last travel, or of their speed on the way, same axes.
         lost: Motors that miss their command, same axes.
         log_weight: Log probability of each outcome, (run, moment, outcome).
         outcome: Index of each among all outcomes of the movement, (run, moment, outcome).
         speed: Of each motor, (run, moment, outcome, motor) [rad/s]; 0 at rest.
+        bend: What an acceleration may put it off by, same axes [rad]; 0 at rest.
         late: Variance of each motor along its motion, same axes [rad2]; 0 at rest.
         done: Share of the movement that each motor had made, (run, moment, motor).
         kept: Probability that what became of the moment before holds on, (run, moment): 1 in one
@@ -64,6 +68,7 @@ class Moments:
     log_weight: FloatArray
     outcome: IntArray
     speed: FloatArray
+    bend: FloatArray
     late: FloatArray
     done: FloatArray
     kept: FloatArray
@@ -107,13 +112,14 @@ def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
         start=np.nan_to_num(movements.start),
         ramp=np.nan_to_num(movements.ramp_duration),
         time=np.nan_to_num(0.5 * (evidence.begin + evidence.end)),
-        base=base,
-        direction=direction,
+        base=base + BEND * bend,
+        direction=np.where(speed != 0.0, np.sign(speed), direction),
         lost=lost,
         log_weight=weight,
         outcome=chosen,
         speed=speed,
-        late=(speed * model.start_jitter_s) ** 2 + bend**2,
+        bend=bend,
+        late=(speed * model.start_jitter_s) ** 2 + (OWN_BEND * bend) ** 2,
         done=movements.done,
         kept=_kept(movements, way),
     )
@@ -158,6 +164,7 @@ def _with_waiting(moments: Moments, late: FloatArray) -> Moments:
         log_weight=np.concatenate([weight + log_of(1.0 - late)[..., None], waits], axis=-1),
         outcome=np.concatenate([moments.outcome, np.zeros_like(moments.outcome[..., :1])], axis=-1),
         speed=more("speed", still),
+        bend=more("bend", still),
         late=more("late", still),
     )
 

@@ -17,7 +17,7 @@ from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.inference.engine.integral import Noise
 from failuretwin.inference.engine.moments import Moments
 from failuretwin.inference.engine.outcomes import Outcomes
-from failuretwin.inference.engine.theta import Layout, columns
+from failuretwin.inference.engine.theta import Layout, Motion, columns
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
@@ -106,7 +106,8 @@ class Scene:
         """
         noise = Noise(model.settling.tail_dof, model.sensors.dims, model.outlier_log_density)
         pose = model.settle(moments.base, moments.direction, model.none_held)
-        G = columns(model, pose, moments.direction, moments.speed, layout)
+        motion = Motion(moments.direction, moments.speed, moments.bend)
+        G = columns(model, pose, motion, layout)
         usual = G[:, :, 0]
         spread = usual @ covariance @ np.swapaxes(usual, -1, -2)
         healthy = Outcomes.of_poses(model, moments, pose, model.scatter**2, moments.late)

@@ -1,11 +1,13 @@
 """Theta: what all moments of a robot share and nobody knows exactly.
 
-    f = G theta,    G = [ I | -[x]x | x | J | J diag(g) | -J diag(d) | dx/dgeometry | -J diag(qd) ]
+    f = G theta
+    G = [ I | -[x]x | x | J | J diag(g) | -J diag(d) | dx/dgeometry | -J diag(qd) | J b ]
 
 with origin t [m], turn w [rad] and scale k [-] of the tool sensor's frame, bias b [rad], compliance
 c [rad/(N m)] and friction f [rad] of each motor, the frames of the joints, each moved [m] and
 turned [rad], and, of robots that are seen on the way, the lag of each motor [s] beside the mean one
-of the robot. The prior is a mixture of normal distributions.
+of the robot, and by which share of b = T^2 qdd / 2 their motors are off an accelerated command,
+beside the mean one. The prior is a mixture of normal distributions.
 
 Section: docs/inference.md#theta
 """
@@ -31,6 +33,8 @@ KNOWN = 1e-6
 """Deviation that stands for "known" in each unit of theta."""
 LEAST_SCATTER_RAD = 1e-4
 """Scatter beside which doubts of offsets are judged, at least [rad]."""
+BEND_SPREAD = 0.5
+"""Deviation of the share of `Stretches.bend` by which motors are off; assumed."""
 ODD_RATE, ODD_FACTOR = 0.1, 3.0
 """Share of robots whose offsets differ more than those of others of their kind, and how many times
 as far; assumed."""
@@ -43,7 +47,7 @@ class Layout:
     Attributes:
         motors: Number of motors.
         geometry: Whether the frames of the joints are unknown.
-        moving: Whether moments on the way tell of lags.
+        moving: Whether moments on the way tell of lags and bends.
     """
 
     motors: int
@@ -66,12 +70,17 @@ class Layout:
         return slice(self.frames.stop, self.frames.stop + self.motors * self.moving)
 
     @property
+    def bend(self) -> slice:
+        """Place of the share of bends."""
+        return slice(self.lags.stop, self.lags.stop + self.moving)
+
+    @property
     def size(self) -> int:
         """Length of theta."""
-        return self.lags.stop
+        return self.bend.stop
 
     def place(self, theta: FloatArray) -> FloatArray:
-        """Return where theta is expanded: registration and offsets of it, frames and lags at 0."""
+        """Return where theta is expanded: registration and offsets of it, all else at 0."""
         kept = np.arange(len(theta)) < self.offsets.stop
         return np.where(kept, theta, 0.0)
 
@@ -203,20 +212,28 @@ class Components:
         return self.log_weight[run, component]
 
 
-def columns(
-    model: HealthyModel,
-    pose: FloatArray,
-    direction: FloatArray,
-    speed: FloatArray,
-    layout: Layout,
-) -> FloatArray:
+@dataclass(frozen=True)
+class Motion:
+    """How motors move, (..., motor) each.
+
+    Attributes:
+        direction: Sign of the last travel.
+        speed: [rad/s].
+        bend: Half the acceleration times the square of a usual lag [rad].
+    """
+
+    direction: FloatArray
+    speed: FloatArray
+    bend: FloatArray
+
+
+def columns(model: HealthyModel, pose: FloatArray, motion: Motion, layout: Layout) -> FloatArray:
     """Return G at some poses, (..., channel, theta).
 
     Args:
         model: The healthy robot.
         pose: Settled angles, (..., motor) [rad].
-        direction: Sign of the last travel, (..., motor).
-        speed: (..., motor) [rad/s].
+        motion: How the motors move there.
         layout: Places in theta.
     """
     value, jacobian = model.sensors.expected(pose)
@@ -228,11 +245,12 @@ def columns(
         rigid[..., own, 3:6] = np.swapaxes(np.cross(np.eye(3), x[..., None, :]), -1, -2)
         rigid[..., own, 6] = x
     load = loads(model, pose)[..., None, :]
-    parts = [rigid, jacobian, jacobian * load, -jacobian * direction[..., None, :]]
+    parts = [rigid, jacobian, jacobian * load, -jacobian * motion.direction[..., None, :]]
     if layout.geometry:
         parts.append(model.twin.geometry_columns(pose))
     if layout.moving:
-        parts.append(-jacobian * speed[..., None, :])
+        parts.append(-jacobian * motion.speed[..., None, :])
+        parts.append(jacobian @ motion.bend[..., None])
     return np.concatenate(parts, axis=-1)
 
 
@@ -328,6 +346,7 @@ def _covariance(model: HealthyModel, layout: Layout, factor: float) -> FloatArra
     if layout.moving:
         common, own = model.lag_deviations_s
         covariance[layout.lags, layout.lags] = common**2 + own**2 * np.eye(motors)
+        covariance[layout.bend, layout.bend] = BEND_SPREAD**2
     return covariance
 
 

@@ -251,9 +251,13 @@ class HealthyModel:
 
     @property
     def knows_timing(self) -> bool:
-        """Whether it is known how late and how evenly this robot starts to move."""
+        """Whether it is known how late and how evenly this robot follows its commands.
+
+        Commands alone tell late starts, but nothing of that.
+        """
+        known, nothing = self.imperfections.timing, Timing()
         exact = self.imperfections.settling is None
-        return exact or self.imperfections.timing != Timing()
+        return exact or (known.delay_s, known.lag_s) != (nothing.delay_s, nothing.lag_s)
 
     @cached_property
     def lag_s(self) -> float:

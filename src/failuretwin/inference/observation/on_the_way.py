@@ -3,7 +3,9 @@
 A stretch is the part of a movement up to one reading. The tool is expected where the command was a
 lag before; whoever starts early or late, or follows with another lag, is off along the motion:
 
-    e_k = y(q(t_k - lag)) - J qd (lag of each motor),    variance along it (qd sigma)^2
+    e_k = y(q(t_k - lag)) - J qd (lag of each motor) + J qdd (sum of squared time constants) / 2
+
+with variance along the motion (qd sigma)^2: motors follow as a chain of first-order lags does.
 
 A rest is a stretch with qd = 0. Readings near each other share one lag and one scatter: they are
 pooled.
@@ -18,9 +20,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from failuretwin.core.movements import Stretches
-from failuretwin.core.types import FloatArray, IntArray, as_floats
+from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.lag_offset import lag_offset
 
 SHARE = 0.85
 """Share of a stretch's time at which it is read: late, so that what a motor was told shows, and
@@ -38,8 +41,8 @@ STANDS_S = 0.12
 CORNER_S = 0.06
 """Speed is the mean over twice that [s]: near a corner of the command a lag tells which it is."""
 BEND_S = 0.05
-"""Time constant with which motors follow [s], assumed: where a command accelerates by a, they are
-off the same command a lag before by half its square times a."""
+"""Time constant with which motors follow, at most [s], assumed: where a command accelerates by a,
+they are off the same command a lag before by a share of half its square times a."""
 CURVED_RAD = 0.01
 """A movement whose command strays further from straight ramps is a curve [rad]."""
 
@@ -61,26 +64,39 @@ class _Moment:
     curved: bool
 
 
-def on_the_way(evidence: Evidence, model: HealthyModel) -> SettledEvidence:
-    """Return settled positions, and moments on the way of runs that hardly rest.
+def hardly_rest(evidence: Evidence, model: HealthyModel) -> BoolArray:
+    """Return which runs are judged by readings on the way, (run,).
 
-    Of a run with more than `MOST_RESTS`, or with any of a robot whose timing is calibrated, that is
-    what `Evidence.settled` says: where motors settle is known better than how they get there.
+    Those with `MOST_RESTS` at most, or with none of a robot whose timing is calibrated: where
+    motors settle is known better than how they get there.
+    """
+    settled = evidence.settled
+    rests, movements = settled.usable.sum(axis=1), settled.movements.exists.sum(axis=1)
+    most = 0 if model.knows_timing else MOST_RESTS
+    sound = np.array([not quality.fatal for quality in evidence.quality], dtype=bool)
+    return np.asarray((rests <= most) & (2 * rests < movements) & sound)
+
+
+def likeliest_lag(evidence: Evidence, model: HealthyModel) -> float:
+    """Return how far the runs that hardly rest trail their commands [s]; they share a set-up."""
+    some = np.flatnonzero(hardly_rest(evidence, model))
+    return model.lag_s + lag_offset(evidence, model, some)
+
+
+def on_the_way(evidence: Evidence, model: HealthyModel, lag_s: float) -> SettledEvidence:
+    """Return settled positions, and moments on the way of runs that hardly rest.
 
     Args:
         evidence: What the runs say.
-        model: The healthy robot: its mean lag, and how early its ramps end.
+        model: The healthy robot: how early its ramps end.
+        lag_s: How far the tool trails its commands [s], as `likeliest_lag` returns it.
     """
     settled = evidence.settled
-    exists, usable = settled.movements.exists, settled.usable
-    rests = usable.sum(axis=1)
-    most = 0 if model.knows_timing else MOST_RESTS
-    hardly = (rests <= most) & (2 * rests < exists.sum(axis=1))
-    hardly &= [not quality.fatal for quality in evidence.quality]
-    unseen = exists & ~usable & hardly[:, None]
+    hardly = hardly_rest(evidence, model)
+    unseen = settled.movements.exists & ~settled.usable & hardly[:, None]
     if not model.sensors.tool_alone or not unseen.any():
         return settled
-    looks = _Looks(evidence, model)
+    looks = _Looks(evidence, model, lag_s)
     found = {(run, m): looks.moments(run, m) for run, m in np.argwhere(unseen).tolist()}
     if not any(found.values()):
         return settled
@@ -89,14 +105,21 @@ def on_the_way(evidence: Evidence, model: HealthyModel) -> SettledEvidence:
 
 @dataclass(frozen=True)
 class _Looks:
-    """Reads moments on the way of single movements."""
+    """Reads moments on the way of single movements.
+
+    Attributes:
+        evidence: What the runs say.
+        model: The healthy robot.
+        lag_s: How far the tool trails its commands [s].
+    """
 
     evidence: Evidence
     model: HealthyModel
+    lag_s: float
 
     def moments(self, run: int, m: int) -> list[_Moment]:
         """Return the moments on the way of a movement."""
-        settled, lag = self.evidence.settled, self.model.lag_s
+        settled, lag = self.evidence.settled, self.lag_s
         movements = settled.movements
         time, read = as_floats(self.evidence.runs["time"].values), self.evidence.read[run]
         start, end = movements.start[run, m], settled.end[run, m]
@@ -128,11 +151,11 @@ class _Looks:
     ) -> _Moment:
         time = as_floats(self.evidence.runs["time"].values)
         start = self.evidence.settled.movements.start[run, m]
-        end = self.evidence.settled.end[run, m]
+        end, lag = self.evidence.settled.end[run, m], self.lag_s
 
         def told(when: FloatArray) -> FloatArray:
             """Return what the motors have been told that is to be seen, (time, motor) [rad]."""
-            since = (when - self.model.lag_s - start) / (1.0 - early)
+            since = (when - lag - start) / (1.0 - early)
             return self._command(run, np.minimum(start + since, max(end, start)))
 
         near = self._near(run, at)
@@ -141,7 +164,7 @@ class _Looks:
         path = self.model.sensors.expected(pose)[0]
         off = np.median(point[near] - path[:-1], axis=0)
         ends = told(time[at] + CORNER_S * np.array([-1.0, 1.0]))
-        lasted = (time[at] - self.model.lag_s - begin) / (1.0 - early)
+        lasted = (time[at] - lag - begin) / (1.0 - early)
         ramp = np.maximum(self.evidence.settled.movements.ramp_duration[run, m], 1e-3)
         return _Moment(
             begin,
@@ -151,8 +174,8 @@ class _Looks:
             pose[-1],
             np.minimum(ramp, lasted),
             (ends[1] - ends[0]) / (2.0 * CORNER_S),
-            0.5 * (BEND_S / CORNER_S) ** 2 * np.abs(ends[0] - 2.0 * pose[-1] + ends[1]),
-            np.clip((time[at] - self.model.lag_s - start) / (1.0 - early) / ramp, 0.0, 1.0)
+            0.5 * (BEND_S / CORNER_S) ** 2 * (ends[0] - 2.0 * pose[-1] + ends[1]),
+            np.clip((time[at] - lag - start) / (1.0 - early) / ramp, 0.0, 1.0)
             if not curved
             else np.ones_like(ramp),
             not curved,

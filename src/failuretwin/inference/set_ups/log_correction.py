@@ -145,7 +145,7 @@ class LogCorrection:
                 movements,
                 beginning=self.command(movements.beginning),
                 speed=movements.speed @ self.C.T,
-                bend=movements.bend @ np.abs(self.C).T,
+                bend=movements.bend @ self.C.T,
                 done=movements.done @ order.T,
             )
         return replace(evidence, movements=movements, point=self.point(evidence.point))

@@ -146,7 +146,7 @@ def begun(
     runs say that it may not be, it is known or anywhere near, by the odds of the set-up.
     """
     model = likelihood.model
-    layout = layout_of(model.without_doubt)
+    layout = layout_of(model.without_doubt, bool(likelihood.evidence.on_the_way.any()))
     believed = robot_components(model, layout, AS_TOLD)
     usual = unit = believed.usual_deviation
     in_doubt = doubted(likelihood, hypotheses, priors)

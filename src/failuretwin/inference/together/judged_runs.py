@@ -103,6 +103,7 @@ class Judged:
                 shift = told.information @ now + told.score
                 np.add.at(habits.precision, run, weight[:, None, None] * told.information)
                 np.add.at(habits.shift, run, weight[:, None] * shift)
+        habits.forget_tails(np.flatnonzero(self.weighing.likelihood.evidence.on_the_way))
         return habits
 
     def _telling(self) -> Iterator[ThetaPart]:
