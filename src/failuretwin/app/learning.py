@@ -110,12 +110,7 @@ def found_in(
 ) -> Findings:
     """Return diagnoses of runs.
 
-    Args:
-        runs: The runs.
-        bayes: The Bayesian diagnoser.
-        diagnoser: What diagnoses runs that teach nothing.
-        tracking: What learns run by run; None: nothing does.
-        start: What learning from all runs at once begins with; None: nothing learns so.
+    `tracking` learns run by run, `start` begins to learn from all runs at once; None: neither.
     """
     if tracking is not None:
         return tracking.diagnose(runs)
@@ -125,12 +120,7 @@ def found_in(
 
 
 def self_calibrated(runs: xr.Dataset, bayes: BayesDiagnoser, start: Start) -> Findings:
-    """Return diagnoses that learn the robot from all runs at once.
-
-    Raises:
-        InputError: If nothing can be learned.
-        OutputError: If the calibration cannot be written.
-    """
+    """Return diagnoses that learn the robot from all runs at once."""
     robot, out, calibration = bayes.twin.robot, start.out, start.calibration
     if out is not None:
         begun = calibration is not None and calibration.resolve() == out.resolve()
@@ -155,13 +145,6 @@ class Tracking:
     """Diagnosis run by run, which goes on from the history of a robot.
 
     The history lies in the store, beside the calibration, or beside `start.out`.
-
-    Args:
-        bayes: How to diagnose.
-        start: What it begins with.
-
-    Raises:
-        InputError: If there are two places for the history, or it cannot be read.
     """
 
     def __init__(self, bayes: BayesDiagnoser, start: Start) -> None:

@@ -12,7 +12,10 @@ class FailureTwinError(Exception):
 
 
 class InputError(FailureTwinError, ValueError):
-    """Unusable input; the text says how to fix it."""
+    """Unusable input; the text says how to fix it.
+
+    Public functions list it under `Raises`; all others pass it on.
+    """
 
 
 class OutputError(FailureTwinError, OSError):

@@ -97,10 +97,7 @@ def read_text(path: Path, kind: str, fix: str = "") -> str:
 def check_size(claimed: float, path: Path, what: str) -> None:
     """Raise InputError if reading would take more memory than file and machine allow.
 
-    Args:
-        claimed: Bytes needed, as the file declares them.
-        path: The file, or a folder of files.
-        what: Part of the file that needs them, such as ``its arrays``.
+    By its own words the file needs `claimed` bytes for `what`, such as ``its arrays``.
     """
     stored = stored_bytes(path)
     if claimed > max(LEAST_BYTES, EXPANSION * stored):

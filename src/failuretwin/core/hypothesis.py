@@ -110,10 +110,6 @@ def parse_hypotheses(
 ) -> tuple[Hypothesis, ...]:
     """Return several hypotheses.
 
-    Args:
-        given: Hypotheses, or their text form.
-        motors: Names of the robot's motors in chain order.
-
     Raises:
         InputError: If one is not valid or repeated, none is given, or a text is given instead of a
             list.

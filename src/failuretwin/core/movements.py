@@ -297,9 +297,7 @@ def _merge_starts(starts: FloatArray) -> FloatArray:
 def _after_rests(start: FloatArray, moving: FloatArray) -> FloatArray:
     """Return the starts that follow a rest of all motors, and the first one.
 
-    Args:
-        start: Start of each movement, (movement,) [s].
-        moving: Start and end of every line with motion, (line, 2) [s].
+    Starts are (movement,) [s]; lines with motion are (line, 2) [s], start and end.
     """
     kept = []
     for at in start:

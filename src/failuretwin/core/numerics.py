@@ -259,9 +259,7 @@ def log_student(error: FloatArray, root: FloatArray, noise: float, dof: float) -
 def log_normal_2d(error: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return log N(error; 0, S) in two dimensions, (...), in closed form.
 
-    Args:
-        error: (..., 2).
-        covariance: S, (..., 2, 2).
+    The error is (..., 2), the covariance S (..., 2, 2).
     """
     (aa, ab), (_, bb) = np.moveaxis(covariance, (-2, -1), (0, 1))
     a, b = np.moveaxis(error, -1, 0)
@@ -276,9 +274,7 @@ def log_normal_2d(error: FloatArray, covariance: FloatArray) -> FloatArray:
 def masked_median(values: FloatArray, kept: BoolArray) -> FloatArray:
     """Return the median of the kept values in each row, (row,); 0 without any.
 
-    Args:
-        values: (row, value).
-        kept: Which of them count, same axes.
+    Values are (row, value), as is which of them are kept.
     """
     if values.shape[1] == 0:
         return np.zeros(len(values))

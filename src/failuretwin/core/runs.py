@@ -213,10 +213,6 @@ def run_set(
 def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:
     """Return `runs` if they satisfy the contract of a run set.
 
-    Args:
-        runs: The dataset to check.
-        where: Its name in errors, such as its path.
-
     Raises:
         InputError: With the first violation and the expected value.
     """

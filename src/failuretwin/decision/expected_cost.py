@@ -73,11 +73,7 @@ class Costs(Bounded):
     currency: str = ""
 
     def missed_by(self, fault: Fault) -> Missed:
-        """Return the shares of a fault.
-
-        Raises:
-            InputError: If neither its mode nor `any` has a row.
-        """
+        """Return the shares of a fault."""
         row = self.missed.get(fault.mode, self.missed.get(ANY))
         if row is None:
             raise InputError(
@@ -88,11 +84,7 @@ class Costs(Bounded):
 
 
 def load_costs(path: str | Path) -> Costs:
-    """Load the user's costs from a TOML file; see `TEMPLATE`.
-
-    Raises:
-        InputError: If it cannot be read, lacks a figure or holds one that makes no sense.
-    """
+    """Load the user's costs from a TOML file; see `TEMPLATE`."""
     return from_table(Costs, read_toml(Path(path)), str(path))
 
 

@@ -43,11 +43,7 @@ def part_name(piece: int) -> str:
 
 
 def part_files(folder: Path) -> list[Path]:
-    """Return the files of a folder of results, in the order of the runs.
-
-    Raises:
-        InputError: If there are none.
-    """
+    """Return the files of a folder of results, in the order of the runs."""
     found = sorted(folder.glob("part-*.parquet"))
     if not found:
         raise InputError(f"{folder}: holds no results. Expected the output of diagnose --parquet.")
@@ -57,13 +53,7 @@ def part_files(folder: Path) -> list[Path]:
 def write_part(diagnoses: Sequence[Diagnosis], hypotheses: Sequence[str], path: Path) -> None:
     """Write diagnoses to one file, which appears whole.
 
-    Args:
-        diagnoses: Diagnoses of some runs.
-        hypotheses: All hypotheses, a column each.
-        path: The file.
-
-    Raises:
-        OSError: If it cannot be written.
+    Each hypothesis has a column.
     """
     import pyarrow as pa
 
@@ -131,9 +121,6 @@ def read_diagnoses(folder: str | Path, texts: bool = True) -> Iterator[Diagnosis
         folder: The output of `diagnose --parquet`.
         texts: Whether verdict, explanation, evidence and quality are read, which scores do not
             need.
-
-    Raises:
-        InputError: If it holds no results, a file cannot be read, or pyarrow is missing.
     """
     for row in _rows(Path(folder), texts):
         fields: dict[str, Any] = {name: row[name] for name in SCORED}

@@ -51,11 +51,7 @@ KNOWN = frozenset(field.name for field in fields(Record))
 
 @dataclass(frozen=True)
 class Results:
-    """Diagnoses by one method; `name` identifies them in errors and tables.
-
-    Raises:
-        InputError: If a run occurs twice.
-    """
+    """Diagnoses by one method; `name` identifies them in errors and tables."""
 
     name: str
     diagnoses: Sequence[Diagnosis | Record]

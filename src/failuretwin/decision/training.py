@@ -231,9 +231,6 @@ class Stream:
         """Yield chunks of new runs without end, in order.
 
         Scripts must be guarded by ``if __name__ == "__main__":``.
-
-        Raises:
-            FailureTwinError: If one of the processes ends.
         """
         loader: DataLoader[Batch] = DataLoader(
             _Chunks(self.data, self.encoder, CHUNK_RUNS),

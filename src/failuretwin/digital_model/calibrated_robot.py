@@ -162,11 +162,6 @@ def calibration_from_table(
 ) -> CalibratedRobot:
     """Return a robot with the calibration of a TOML table.
 
-    Args:
-        table: Contents of a calibration file.
-        robot: The robot.
-        path: File or place of the table, for texts.
-
     Raises:
         InputError: If the table is no calibration, belongs to another robot or does not fit its
             motors.

@@ -120,10 +120,8 @@ def with_tool(chain: SerialChain, tool_xyz: Triple) -> SerialChain:
 def seen_chain(chain: SerialChain, base_xyz_rpy: Pose, scale: float = 1.0) -> SerialChain:
     """Return the chain to the tool point in the sensor's frame and scale.
 
-    Args:
-        chain: The chain from the base link; with sliding joints the scale must be 1.
-        base_xyz_rpy: Pose of the base link in the sensor's frame.
-        scale: Length that the sensor reports for a metre.
+    `base_xyz_rpy` is the pose of the base link in the sensor's frame; with sliding joints the scale
+    must be 1.
     """
     if base_xyz_rpy == NOT_MOVED and scale == 1.0:
         return chain

@@ -260,10 +260,8 @@ def feedback_factor(jacobian: FloatArray) -> FloatArray:
         rho_k = (J+)_k J_k
 
     With motor k held, nominal corrections dq = J+ r leave J_k (J+)_k r, a matrix of rank one: each
-    step leaves rho_k of the last error. Near 1, feedback alone does not converge.
-
-    Args:
-        jacobian: Of the tool position, (..., 3, motor) [m/rad].
+    step leaves rho_k of the last error. Near 1, feedback alone does not converge. The Jacobian is
+    that of the tool position, (..., 3, motor) [m/rad].
     """
     inverse = np.linalg.pinv(jacobian)
     return np.asarray(np.einsum("...ka,...ak->...k", inverse, jacobian))

@@ -222,11 +222,7 @@ def init(out: Path, home: str | None, urdf: UrdfOptions) -> None:
 
 
 def _check_profile(out: Path, replaced: Path | None = None) -> None:
-    """Check the name of a profile to write; only the profile `replaced` may be overwritten.
-
-    Raises:
-        InputError: If it does not end in .toml, or another file has this name.
-    """
+    """Check the name of a profile to write; only the profile `replaced` may be overwritten."""
     if out.suffix != ".toml":
         raise InputError(f"{out}: a profile ends in .toml. Give such a name.")
     if out.exists() and (replaced is None or out.resolve() != replaced.resolve()):

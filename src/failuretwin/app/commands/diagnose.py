@@ -220,11 +220,7 @@ def _diagnose_many(
     stored: RobotRecord | None,
     recorded: datetime | None,
 ) -> None:
-    """Diagnose runs of any number into parquet files, and store the diagnoses if there is a store.
-
-    Raises:
-        InputError: If an option needs all runs in memory.
-    """
+    """Diagnose runs of any number into parquet files, and store the diagnoses if asked to."""
     from failuretwin.app.many_runs import diagnose_many, remember_many
 
     opt.refuse_unused("--parquet holds a piece of the runs in memory, not all", *WHOLE)

@@ -72,9 +72,7 @@ def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F],
 def refuse_unused(why: str, *names: str) -> None:
     """Raise InputError if the user has given options that have no effect here, and say why.
 
-    Args:
-        why: The reason, the beginning of a sentence.
-        names: Names of the parameters.
+    The reason is the beginning of a sentence.
     """
     context = click.get_current_context()
     given = [

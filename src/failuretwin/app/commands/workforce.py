@@ -32,9 +32,7 @@ class WorkforceOptions:
 def workforce_options(result: str, shared: str) -> Callable[[opt.F], opt.F]:
     """Return the options `--workers N` and `--scheduler ADDRESS`.
 
-    Args:
-        result: What does not depend on them.
-        shared: Files that the workers of a scheduler must share.
+    `result` does not depend on them; workers of a scheduler must share the files `shared`.
     """
     return opt.gathered(
         WorkforceOptions,

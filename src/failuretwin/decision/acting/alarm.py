@@ -36,8 +36,7 @@ class AlarmChange:
 class FaultAlarm:
     """Follows the belief of an arm at work.
 
-    Args:
-        report: Called with each change.
+    Calls `report` with each change of the alarm.
     """
 
     def __init__(self, report: Callable[[AlarmChange], None]) -> None:

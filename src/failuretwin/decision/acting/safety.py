@@ -117,9 +117,7 @@ class SafetyGate:
     def wrong(self, order: Order, ways: Sequence[Way]) -> str:
         """Return why an order must not be sent, empty if it may.
 
-        Args:
-            order: The order.
-            ways: Ways that the arm may take with it; the first: as the motors are told.
+        Of the ways that the arm may take, the first is as the motors are told.
         """
         if not (np.isfinite(order.target).all() and np.isfinite(order.duration).all()):
             return "the order holds a value that is not finite"
@@ -136,9 +134,6 @@ class SafetyGate:
         """Return what an arm would come too near to on some ways, empty if to nothing.
 
         An arm that stands too near already may go where it comes no nearer.
-
-        Args:
-            ways: Begin and end of each, (motor,) [rad].
         """
         poses = [way_between(start, end) for start, end in ways]
         first = np.cumsum([0, *(len(way) for way in poses)])

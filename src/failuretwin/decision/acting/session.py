@@ -82,11 +82,7 @@ class Acting:
     ) -> Sequence[TargetResult]:
         """Carry a task out on an arm and return what became of each target.
 
-        Args:
-            task: The task.
-            commander: The arm.
-            tell: Called with what is found out and done, as it happens.
-            report: Called with each change of the alarm.
+        `report` is called with each change of the alarm.
         """
         standing = first_standing(commander)
         actor, alarm = self.actor(task, standing, tell), FaultAlarm(report)

@@ -44,12 +44,7 @@ def check_network_file(path: Path) -> None:
 
 
 def save_network(diagnoser: LearnedDiagnoser, path: str | Path) -> None:
-    """Write a trained network; an existing file is replaced atomically.
-
-    Raises:
-        InputError: If the suffix is not .npz.
-        OutputError: If it cannot be written.
-    """
+    """Write a trained network; an existing file is replaced atomically."""
     path = Path(path)
     check_network_file(path)
     configuration = json.dumps(_configuration(diagnoser)).encode()
@@ -196,10 +191,6 @@ def export_onnx(diagnoser: LearnedDiagnoser, path: Path) -> None:
 
     Its input is `features` (run, 100, channel), its output `probabilities` (run, class); the
     metadata entry `classes` lists the classes.
-
-    Raises:
-        InputError: If onnxscript is missing.
-        OutputError: If the file cannot be written.
     """
     with needs_extra("ONNX files need onnxscript", "learn"):
         import onnxscript  # noqa: F401

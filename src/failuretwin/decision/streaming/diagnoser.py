@@ -32,17 +32,7 @@ HEADER = "header"
 
 
 def save_fleet(fleet: StreamingFleet, path: str | Path, said: Sequence[Diagnosis] = ()) -> None:
-    """Write the state of a stream; a file of that name is replaced at the end, all at once.
-
-    Args:
-        fleet: The stream.
-        path: Where to.
-        said: Diagnoses to be kept with it.
-
-    Raises:
-        InputError: If the suffix is not .npz.
-        OutputError: If it cannot be written.
-    """
+    """Write the state of a stream; a file of that name is replaced at the end, all at once."""
     path = Path(path)
     if path.suffix != SUFFIX:
         raise InputError(f"{path}: the file of a stream ends in {SUFFIX}.")
@@ -67,13 +57,7 @@ def load_fleet(
 ) -> tuple[StreamingFleet, list[Diagnosis]]:
     """Return a stream as it was saved, and the diagnoses that were kept with it.
 
-    Args:
-        path: The file.
-        diagnoser: The method with which it was saved.
-        robots: How many robots there must be; None: any number.
-
-    Raises:
-        InputError: If it is no such file or of another robot, method or number of robots.
+    `robots` is how many there must be; None: any number.
     """
     path = Path(path)
     with reading(path, "a stream", "Expected a file that `save` of a stream wrote."):
@@ -113,8 +97,7 @@ def _mismatch(header: dict[str, Any], diagnoser: BayesDiagnoser, robots: int | N
 class RobotStream:
     """A stream of one robot: an answer at every sample.
 
-    Args:
-        fleet: What its movements say; a fleet of one.
+    Its movements are followed by a fleet of one.
     """
 
     def __init__(self, fleet: StreamingFleet) -> None:
@@ -220,15 +203,7 @@ def row_of(values: ArrayLike | None) -> FloatArray | None:
 def reference_of(
     motors: Sequence[str], command: Mapping[str, float] | ArrayLike | None
 ) -> FloatArray | None:
-    """Return a reference as an array, (motor,) [rad]; None stays None.
-
-    Args:
-        motors: Names of the motors in chain order.
-        command: Reference of every motor, by name or (motor,) [rad].
-
-    Raises:
-        InputError: If a motor is missing.
-    """
+    """Return a reference as an array, (motor,) [rad]; None stays None."""
     if not isinstance(command, Mapping):
         return None if command is None else as_floats(command)
     for name in motors:

@@ -51,11 +51,7 @@ class LifeLearner:
 
     The frame of the sensor is taken to be as the profile says. A run is worked on in a thread of
     its own, so that answers need not wait; what it taught is known when the next run is complete,
-    however fast time passes.
-
-    Args:
-        diagnoser: The method, with its hypotheses and priors.
-        memory: What keeps what is learned; None: nothing does.
+    however fast time passes. What is learned is kept by `memory`; None: it is not kept.
     """
 
     def __init__(
@@ -84,9 +80,8 @@ class LifeLearner:
     def take(self, movement: SettledEvidence, learns: bool) -> bool:
         """Take in a finished movement and return whether the model has changed.
 
-        Args:
-            movement: A run of this movement alone, by the time of the stream.
-            learns: Whether it is worth while; else it is only remembered for a while.
+        The movement is a run by itself, by the time of the stream. One that is not worth learning
+        is remembered for a while.
         """
         self._waiting.append(movement)
         run = RUN if self.movements < LITTLE else LONG_RUN

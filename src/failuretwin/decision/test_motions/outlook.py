@@ -178,8 +178,7 @@ class Outlook:
     def after(self, told: FloatArray) -> Outlook:
         """Return the same with motors that are held where movements would show it least.
 
-        Args:
-            told: What motors were told, the start first, (movement, motor) [rad].
+        `told` is what motors were told, the start first, (movement, motor) [rad].
         """
         last = max(len(told) - 2, 0)
         begin = (0, 0, len(told) // 2, last)

@@ -42,9 +42,6 @@ class ProbeRules:
         most: Movements at most for a suspicion, the ways back not counted; 0: never.
         idle_s: Time since the last command of others was carried out [s].
         moves: Whether orders are really sent; else what would be ordered is told.
-
-    Raises:
-        InputError: If a number is negative or not finite.
     """
 
     most: int
@@ -62,12 +59,7 @@ class ProbeRules:
 class Prober:
     """Decides when a watched arm is asked, and asks it. It is a sink of the watch.
 
-    Args:
-        monitor: The watch.
-        gate: What is safe.
-        commander: The arm; also the source of the watch.
-        rules: When and how often.
-        seed: Seed of the poses that are tried.
+    The arm is also the source of the watch.
     """
 
     trouble = ""

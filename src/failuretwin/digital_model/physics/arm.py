@@ -39,11 +39,8 @@ def arm_spec(robot: Robot, payload: float = 0.0) -> Any:
     """Return the robot as a `mujoco.MjSpec` that can still be changed.
 
     Joints turn in the physical sense and keep their URDF names; joints without a motor stay at
-    zero. Gravity points down the z axis of the base frame.
-
-    Args:
-        robot: The robot.
-        payload: Point mass at the tool point [kg].
+    zero. Gravity points down the z axis of the base frame. The payload is a point mass at the tool
+    point [kg].
 
     Raises:
         InputError: If mujoco is missing or cannot use the URDF.
