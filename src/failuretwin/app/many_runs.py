@@ -16,7 +16,7 @@ from failuretwin.data_knowledge.run_pieces import PIECE, RunPieces
 from failuretwin.data_knowledge.workers import Workforce
 from failuretwin.decision.chunked_diagnosis import diagnose_to_parquet
 from failuretwin.decision.evaluation import Judged
-from failuretwin.decision.parquet_results import read_diagnoses
+from failuretwin.decision.results import read_diagnoses
 from failuretwin.decision.scoring import NO_VERDICT
 from failuretwin.inference.diagnoser import BayesDiagnoser
 

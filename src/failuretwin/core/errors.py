@@ -43,9 +43,6 @@ def needs_extra(who: str, extra: str) -> Iterator[None]:
     Args:
         who: Feature and library, such as ``"pictures need matplotlib"``.
         extra: The extra of this package that installs the library.
-
-    Raises:
-        InputError: If a library is missing; the text says how to install it.
     """
     try:
         yield

@@ -182,9 +182,6 @@ def find_movements(command: FloatArray, time: FloatArray) -> Movements:
     Args:
         command: Reference angles, (run, time, motor) [rad].
         time: Uniform time grid, (time,) [s].
-
-    Raises:
-        InputError: If a command is not finite.
     """
     if not np.all(np.isfinite(command)):
         raise InputError(
@@ -341,9 +338,6 @@ def movements_of_samples(command: FloatArray, time: FloatArray) -> Movements:
     Args:
         command: Reference angles, (sample, motor) [rad].
         time: Increasing times, at least two, (sample,) [s].
-
-    Raises:
-        InputError: If a command is not finite.
     """
     grid, values = _evenly(time, command)
     bends = np.abs(np.diff(values, 2, axis=0))

@@ -199,10 +199,7 @@ def tool_points(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the tool point and its Jacobian, and those of a second point along z of the tool.
 
-    Args:
-        chain: The chain.
-        q: Joint values in chain order, (..., joint) [rad or m].
-        pointer_m: Distance of the second point [m]; 0: none.
+    Joint values are (..., joint) [rad or m]; the second point is `pointer_m` away [m], 0: none.
 
     Returns:
         (..., 3 or 6) [m] and (..., 3 or 6, joint) [m/rad or m/m].

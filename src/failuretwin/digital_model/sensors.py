@@ -363,9 +363,6 @@ def sensor_of(kind: str, twin: DigitalTwin, *profiles: tuple[SensorProfile, ...]
     """Return a sensor of an arm.
 
     The first profile of this kind in the groups applies.
-
-    Raises:
-        InputError: If there is no such kind.
     """
     if kind not in SENSORS:
         raise unknown_name("sensor", kind, SENSORS)

@@ -20,7 +20,6 @@ from failuretwin.app.commands.store import (
     recorded_option,
     store_options,
 )
-from failuretwin.app.commands.workforce import WorkforceOptions, workforce_options
 from failuretwin.app.terminal import show, tell
 from failuretwin.core.errors import InputError
 
@@ -121,7 +120,7 @@ WHOLE = (
 @learned_priors_option
 @recorded_option
 @opt.reading_options
-@workforce_options("results", "the logs and the folder of --parquet")
+@opt.workforce_options("results", "the logs and the folder of --parquet")
 @opt.plugin_option
 @opt.calibrated_robot_options()
 def diagnose(
@@ -144,7 +143,7 @@ def diagnose(
     recorded: datetime | None,
     memory: StoreOptions,
     reading: opt.LogOptions,
-    force: WorkforceOptions,
+    force: opt.WorkforceOptions,
     robot: opt.RobotOptions,
 ) -> None:
     """Diagnose runs from commands and tool path alone, or what other sensors saw (--sensing).

@@ -139,11 +139,11 @@ def advise(
 def _write_template(path: Path) -> None:
     """Write a cost table to fill in; an existing file is never overwritten."""
     from failuretwin.data_knowledge.store import write_text
-    from failuretwin.decision.expected_cost import TEMPLATE
+    from failuretwin.decision.expected_cost import costs_template
 
     if path.exists():
         raise OutputError(f"{path}: is there already. Choose another name.")
-    write_text(TEMPLATE, path)
+    write_text(costs_template(), path)
 
 
 def _results_report(

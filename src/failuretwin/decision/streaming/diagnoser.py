@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from failuretwin.connection.links.base import OK, STALE, Answer
-from failuretwin.core.config import fingerprint
+from failuretwin.core.config import fingerprint, from_table
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.foreign import reading
 from failuretwin.core.hypothesis import Diagnosis
@@ -70,7 +70,7 @@ def load_fleet(
             raise InputError(f"{path}: {wrong}")
         fleet = StreamingFleet(diagnoser, header["robots"], header["rate_hz"], header["movements"])
         fleet.restore(arrays)
-        said = [Diagnosis.from_fields(fields) for fields in header["said"]]
+        said = [from_table(Diagnosis, fields, "diagnosis") for fields in header["said"]]
     return fleet, said
 
 

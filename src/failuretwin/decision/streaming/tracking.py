@@ -101,11 +101,8 @@ OVERDUE_S = 1.0
 class MovementTracker:
     """What is known of the last movements of many robots.
 
-    Args:
-        model: The healthy robot.
-        robots: How many robots there are.
-        movements: Movements that are remembered, the present one included.
-        rate_hz: True rate of the tool sensors [Hz]; None: all readings are real.
+    `movements` are remembered of each robot, the present one included. `rate_hz` is the true rate
+    of the tool sensors [Hz]; None: all readings are real.
     """
 
     def __init__(

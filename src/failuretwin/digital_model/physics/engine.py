@@ -86,10 +86,6 @@ class PhysicsEngine:
                 where the hold begins to the one after it ends. Weakness reduces the servo's torque
                 at any error by the same share; the largest torque stays.
             time: Uniform grid, (time,) [s].
-
-        Raises:
-            InputError: If mujoco is missing, shapes do not fit, the grid is not uniform, or the
-                step is too long for the stiffness of the robot.
         """
         mujoco = load_mujoco()
         _check(drive, len(time), len(self.robot.motors))
@@ -120,9 +116,6 @@ class LiveArms:
         payload: Mass at the tool points, (arm,) [kg].
         weakness: Share of its stiffness that each motor has lost, (arm, motor); None: none.
         pool: A `mujoco.rollout.Rollout` with the engine's threads; None: one of its own.
-
-    Raises:
-        InputError: If mujoco is missing.
     """
 
     def __init__(
@@ -168,9 +161,6 @@ class LiveArms:
 
         Returns:
             (arm, time, motor) [rad].
-
-        Raises:
-            InputError: If the simulation becomes unstable.
         """
         limited = np.concatenate([self._last[:, None], reference * self._sense], axis=1)
         speed = np.array([motor.speed_limit for motor in self._engine.robot.motors])
@@ -261,10 +251,7 @@ class LiveArms:
 def limit_speed(reference: FloatArray, step: float, speed: FloatArray) -> FloatArray:
     """Return references that follow the given ones within a speed limit.
 
-    Args:
-        reference: (run, time, motor) [rad].
-        step: Time between samples [s].
-        speed: Largest speed of each motor, (motor,) [rad/s].
+    References are (run, time, motor) [rad], sampled every `step` [s]; speeds are (motor,) [rad/s].
     """
     largest = speed * step * (1.0 + 1e-9)  # a ramp at exactly this speed is left as it is
     limited = reference.copy()

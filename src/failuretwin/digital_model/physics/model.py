@@ -58,9 +58,6 @@ def build_model(
     """Return the model of a robot.
 
     The time step is in s; the payload is a mass at the tool point [kg].
-
-    Raises:
-        InputError: If mujoco is missing or cannot use the URDF.
     """
     mujoco = load_mujoco()
     spec = arm_spec(robot, payload)
