@@ -13,11 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 
 from failuretwin.connection.links.base import Order
-from failuretwin.core.errors import FailureTwinError, InputError
+from failuretwin.core.config import Bounded, Bounds
+from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.clearance import Clearance
 from failuretwin.digital_model.inverse_kinematics import usable_limits
@@ -40,7 +42,7 @@ class UnsafeOrderError(FailureTwinError):
 
 
 @dataclass(frozen=True)
-class SafetyLimits:
+class SafetyLimits(Bounded):
     """What orders must keep to.
 
     Attributes:
@@ -49,15 +51,9 @@ class SafetyLimits:
         floor_m: Height of the floor in the base frame [m]; None: that of the base.
     """
 
-    speed_share: float = 0.5
+    speed_share: Annotated[float, Bounds(1e-6, 1.0)] = 0.5
     radius_m: float | None = None
     floor_m: float | None = None
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.speed_share <= 1.0:
-            raise InputError(
-                f"speed_share is {self.speed_share:g}, expected a share above 0, 1 at most."
-            )
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from failuretwin.core.config import Bounded, Bounds
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.physics.arm import load_mujoco
@@ -35,7 +36,7 @@ AT_REST_RAD = 1e-13
 
 
 @dataclass(frozen=True)
-class PhysicsEngine:
+class PhysicsEngine(Bounded):
     """Rigid-body dynamics with servos, sticking gears and flexing joints.
 
     Stiffness is the engine's own: `Drive.compliance` is ignored. A run depends neither on the runs
@@ -50,14 +51,11 @@ class PhysicsEngine:
 
     robot: Robot
     parameters: PhysicsParameters | None = None
-    threads: int = 1
-    step_s: float = STEP_S
+    threads: Annotated[int, Bounds(1)] = 1
+    step_s: Annotated[float, Bounds(1e-9)] = STEP_S
 
     def __post_init__(self) -> None:
-        if self.threads < 1:
-            raise InputError(f"threads is {self.threads}, expected 1 or more.")
-        if not self.step_s > 0.0:
-            raise InputError(f"step_s is {self.step_s}, expected a time above zero [s].")
+        super().__post_init__()
         if self.parameters is not None:
             self.parameters.check_fit(self.robot)
 
