@@ -184,7 +184,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     def predict_proba(self, X: Runs) -> FloatArray:
         """Return the probability of each class, (run, class), in the order of `classes_`."""
-        return probabilities(self.scores(X), self.temperature_)
+        return softmax(self.scores(X) / self.temperature_, axis=1)
 
     def predict(self, X: Runs) -> NDArray[Any]:
         """Return the most probable class of each run."""
@@ -289,11 +289,6 @@ def movement_counts(runs: xr.Dataset) -> IntArray:
     """Return the number of movements of each run, (run,)."""
     signals = signals_of(runs)
     return find_movements(signals.command, signals.time).exists.sum(axis=1)
-
-
-def probabilities(scores: FloatArray, temperature: float) -> FloatArray:
-    """Return p_k ~ exp(logit_k / temperature), (run, class)."""
-    return softmax(scores / temperature, axis=1)
 
 
 TEMPERATURES = (0.05, 20.0)

@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import multiprocessing
+import os
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -201,9 +202,7 @@ def _spread(
 ) -> None:
     import torch
 
-    from failuretwin.decision.training import cores
-
-    at_a_time = 1 if torch.cuda.is_available() else min(len(jobs), cores())
+    at_a_time = 1 if torch.cuda.is_available() else min(len(jobs), os.cpu_count() or 1)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(at_a_time, context, initializer=_start) as pool:
         try:
