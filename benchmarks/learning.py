@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from runpy import run_path
 
 import numpy as np
 import onnxruntime
@@ -28,7 +27,7 @@ from failuretwin.decision.learned.networks import (
     shuffled_batches,
     training,
 )
-from failuretwin.decision.learned.storage import export_numpy, export_onnx
+from failuretwin.decision.learned.storage import export_onnx
 from failuretwin.decision.training import CHUNK_RUNS, Stream, TrainingData
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
@@ -96,25 +95,17 @@ def milliseconds(work: Callable[[], object], times: int = 50) -> float:
     return 1000.0 * float(np.median(taken))
 
 
-def exported(name: str, encoder: FeatureEncoder, folder: Path) -> tuple[float, float]:
-    """Return the time to classify one run by ONNX and by the NumPy file, features included [ms]."""
+def exported(name: str, encoder: FeatureEncoder, folder: Path) -> float:
+    """Return the time to classify one run by ONNX [ms]."""
     robot = encoder.robot
     runs = simulate(Plan(robot, paper_hypotheses(robot.motor_names), 2))
     diagnoser = LearnedDiagnoser(name, encoder, iterations=2, random_state=0).fit(runs)
     export_onnx(diagnoser, folder / "network.onnx")
-    export_numpy(diagnoser, folder / "network.py")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(folder / "network.onnx", options)
     features = encoder.encode(signals_of(runs.isel(run=[0])))
-    diagnose = run_path(str(folder / "network.py"))["diagnose"]
-    time_s, command, measured = (
-        values.values for values in (runs["time"], runs["command"][0], runs["measured"][0])
-    )
-    return (
-        milliseconds(lambda: session.run(None, {"features": features})),
-        milliseconds(lambda: diagnose(time_s, command, measured)),
-    )
+    return milliseconds(lambda: session.run(None, {"features": features}))
 
 
 def main() -> None:
@@ -131,15 +122,12 @@ def main() -> None:
     data.chunk(0, CHUNK_RUNS, encoder)
     each = 1000.0 * (time.perf_counter() - begun) / CHUNK_RUNS
     print(f"a training run with its features: {each:.2f} ms on one core\n")
-    print(f"{'network':12s}{'iteration':>12s}{'waits':>8s}{'ONNX':>10s}{'NumPy file':>13s}")
+    print(f"{'network':12s}{'iteration':>12s}{'waits':>8s}{'ONNX':>10s}")
     with tempfile.TemporaryDirectory() as folder:
         for name in NETWORKS:
             iteration, waits = share_waited(name, encoder, data)
-            by_onnx, by_numpy = exported(name, encoder, Path(folder))
-            print(
-                f"{name:12s}{1000 * iteration:9.1f} ms{100 * waits:6.0f} %{by_onnx:7.2f} ms"
-                f"{by_numpy:10.2f} ms"
-            )
+            by_onnx = exported(name, encoder, Path(folder))
+            print(f"{name:12s}{1000 * iteration:9.1f} ms{100 * waits:6.0f} %{by_onnx:7.2f} ms")
 
 
 if __name__ == "__main__":

@@ -307,7 +307,7 @@ def test_an_arm_that_is_left_away_from_its_place_is_told(known):
 
 def test_numbers_that_make_no_sense():
     for most, idle_s in ((-1, 10.0), (3, -1.0), (3, np.inf), (3, np.nan)):
-        with pytest.raises(InputError, match="make no sense"):
+        with pytest.raises(InputError, match="expected a number from 0"):
             ProbeRules(most, idle_s)
 
 

@@ -93,6 +93,13 @@ def test_the_oldest_movement_is_forgotten(sample):
     assert sample.parts[0].start[1].tolist() == [13.0, 14.0, 15.0]
 
 
+def test_movements_come_behind_others(sample):
+    both = sample.extended_by(sample[:, :1])
+    assert both.seen.tolist() == [[True, False, True, True], [False, True, True, False]]
+    assert both.parts[1].start[1].tolist() == [23.0, 24.0, 25.0, 23.0]
+    assert both.first.tolist() == sample.first.tolist()  # has no movements
+
+
 def test_saved_arrays_come_back(sample):
     saved = {name: array.copy() for name, array in sample.to_arrays("some").items()}
     assert sorted(saved) == [

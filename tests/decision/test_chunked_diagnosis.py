@@ -23,7 +23,7 @@ from failuretwin.data_knowledge.workers import Workforce
 from failuretwin.decision import chunked_diagnosis
 from failuretwin.decision.chunked_diagnosis import UnfinishedResults, diagnose_to_parquet
 from failuretwin.decision.evaluation import Truths
-from failuretwin.decision.parquet_results import read_diagnoses
+from failuretwin.decision.results import read_diagnoses
 from failuretwin.failure_behavior.random_movements import RandomMovements
 
 TWO = ["healthy", "motor_3:stuck"]

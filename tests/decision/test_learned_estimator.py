@@ -14,7 +14,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.decision import training as stream_module
-from failuretwin.decision.learned.diagnoser import LearnedDiagnoser, best_temperature, probabilities
+from failuretwin.decision.learned.diagnoser import LearnedDiagnoser, best_temperature
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of, signals_of
 from failuretwin.decision.learned.networks import Standard
 from failuretwin.decision.training import CHUNK_RUNS, Stream, TrainingData
@@ -123,11 +123,6 @@ def test_temperature_of_scores_that_are_too_sure():
     chances = rng.dirichlet([0.5] * 4, 4000)
     truth = np.array([rng.choice(4, p=p) for p in chances])
     assert best_temperature(3.0 * np.log(chances + 1e-12), truth) == pytest.approx(3.0, rel=0.1)
-
-
-def test_probabilities_sum_to_one_even_for_huge_scores():
-    made = probabilities(np.array([[1e4, 0.0, -1e4], [0.0, 0.0, 0.0]]), 0.5)
-    np.testing.assert_allclose(made, [[1.0, 0.0, 0.0], [1 / 3] * 3])
 
 
 def test_calibration_changes_no_verdict(runs, trained):

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import ast
-import importlib.util
 import re
 import sys
 
@@ -18,7 +16,6 @@ from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expecta
 from failuretwin.decision.learned.log_pool import PoolWeights
 from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import (
-    export_numpy,
     export_onnx,
     load_network,
     save_network,
@@ -43,21 +40,6 @@ def trained(armpi, measured_armpi, runs):
         return diagnoser
 
     return {name: make(name) for name in NETWORKS}
-
-
-@pytest.fixture
-def standalone(tmp_path):
-    """Export a network as a Python file and import it."""
-
-    def make(diagnoser):
-        path = tmp_path / "diagnoser.py"
-        export_numpy(diagnoser, path)
-        spec = importlib.util.spec_from_file_location("diagnoser", path)
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        return module, path
-
-    return make
 
 
 @ALL
@@ -86,56 +68,6 @@ def test_onnx_runtime_agrees(trained, runs, network, tmp_path):
         )
     named = session.get_modelmeta().custom_metadata_map["classes"].split(",")
     assert named == list(trained[network].classes_)
-
-
-@ALL
-def test_the_numpy_file_agrees(trained, runs, network, standalone):
-    """From commands and readings to probabilities, by code that shares nothing with ours."""
-    module, _ = standalone(trained[network])
-    chances = trained[network].predict_proba(runs)
-    for i in range(0, 36, 5):
-        end = np.searchsorted(runs["time"].values, runs["duration"].values[i] + 1e-9)
-        said = module.diagnose(
-            runs["time"].values[:end],
-            runs["command"].values[i, :end],
-            runs["measured"].values[i, :end],
-        )
-        np.testing.assert_allclose(said, chances[i], atol=1e-5)
-    assert list(trained[network].classes_) == module.CLASSES
-
-
-@pytest.mark.parametrize("features", ["original", "augmented"])
-def test_the_papers_features_are_in_the_numpy_file(armpi, runs, features, standalone):
-    encoder = FeatureEncoder(features, armpi)
-    diagnoser = LearnedDiagnoser("lstm", encoder, iterations=2, random_state=1).fit(runs)
-    module, _ = standalone(diagnoser)
-    run = runs.isel(run=[3])
-    said = module.diagnose(run["time"].values, run["command"].values[0], run["measured"].values[0])
-    np.testing.assert_allclose(said, diagnoser.predict_proba(run)[0], atol=1e-5)
-
-
-def test_the_numpy_file_needs_numpy_alone_and_no_new_python(trained, standalone):
-    _, path = standalone(trained["cnn"])
-    tree = ast.parse(path.read_text("ascii"), feature_version=(3, 4))
-    imported = {
-        name
-        for node in ast.walk(tree)
-        for name in (
-            [alias.name for alias in node.names]
-            if isinstance(node, ast.Import)
-            else [node.module]
-            if isinstance(node, ast.ImportFrom)
-            else []
-        )
-    }
-    assert imported == {"__future__", "base64", "io", "json", "numpy"}
-    modern = (ast.MatMult, ast.JoinedStr, ast.AnnAssign, ast.Nonlocal, ast.Starred)
-    assert not [node for node in ast.walk(tree) if isinstance(node, modern)]
-    assert all(
-        not node.args.kwonlyargs and node.returns is None
-        for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef)
-    )
 
 
 def test_loading_runs_no_code(armpi, trained, tmp_path):
@@ -187,8 +119,6 @@ def test_a_network_for_another_robot_is_refused(trained, tmp_path):
 def test_names_of_exported_files_are_checked(trained, tmp_path):
     with pytest.raises(InputError, match=r"ends in \.npz"):
         save_network(trained["cnn"], tmp_path / "network.pt")
-    with pytest.raises(InputError, match="cannot be imported"):
-        export_numpy(trained["cnn"], tmp_path / "my-net.py")
 
 
 def test_the_stored_file_holds_versions(trained, tmp_path):

@@ -8,12 +8,12 @@ import pytest
 from failuretwin import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.decision.expected_cost import (
-    TEMPLATE,
     Costs,
     Missed,
     advise,
     cost_of,
     cost_table,
+    costs_template,
     load_costs,
 )
 from failuretwin.decision.remaining_life import remaining_life
@@ -92,15 +92,15 @@ def test_two_faults_need_two_motors():
 
 def test_costs_come_from_the_user_alone(tmp_path):
     path = tmp_path / "costs.toml"
-    path.write_text(TEMPLATE)
+    path.write_text(costs_template())
     found = load_costs(path)
     assert found.currency == "EUR"
     assert found.missed["stuck"].going_on == 0.9
     assert found.healthy == Missed(0.0, 0.0, 0.0)
-    path.write_text(TEMPLATE.replace("missed_target = 1.0", ""))
+    path.write_text(costs_template().replace("missed_target = 1.0", ""))
     with pytest.raises(InputError, match="missed_target"):
         load_costs(path)
-    path.write_text(TEMPLATE.replace("going_on = 0.9", "going_on = 1.9"))
+    path.write_text(costs_template().replace("going_on = 0.9", "going_on = 1.9"))
     with pytest.raises(InputError, match="going_on"):
         load_costs(path)
 

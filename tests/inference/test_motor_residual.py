@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import failuretwin as ft
+from failuretwin.core.config import from_table
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.failure_behavior.registry import load_modes
 from failuretwin.inference.faults.motor_residual import motor_residual
@@ -54,4 +55,4 @@ def test_a_residual_goes_through_json(tmp_path):
     diagnoser, runs = seen(tmp_path, "motor_2", 0.15)
     told = motor_residual(diagnoser.seen(runs).sample, 0)
     diagnosis = Diagnosis("run", {"unknown": 1.0}, residual=told)
-    assert Diagnosis.from_fields(json.loads(json.dumps(asdict(diagnosis)))) == diagnosis
+    assert from_table(Diagnosis, json.loads(json.dumps(asdict(diagnosis))), "") == diagnosis

@@ -1,1 +1,4 @@
-"""The command line and its pictures."""
+"""The command line and its pictures.
+
+Any function here may raise `InputError` or `OutputError`; `cli.main` shows their text.
+"""

@@ -76,11 +76,7 @@ def emulated_arm(
 
 
 def known_arm(robot: Robot, calibration: Path | None = None) -> CalibratedRobot:
-    """Return an emulated robot; None: with the calibration of its profile, or the ideal twin.
-
-    Raises:
-        InputError: If the calibration cannot be read.
-    """
+    """Return an emulated robot; None: with the calibration of its profile, or the ideal twin."""
     ideal = calibration is None and robot.imperfections_file is None
     return load_calibration("none" if ideal else calibration, robot)
 
@@ -89,9 +85,6 @@ def emulation_with(faults: Sequence[str], known: CalibratedRobot, seed: int) -> 
     """Return the settings of an emulated arm with faults, written as for `emulated_arm`.
 
     The size of a stuck motor is its position. Without a start a fault begins at once.
-
-    Raises:
-        InputError: If a fault cannot be read, its mode takes no size, or one mode has two sizes.
     """
     from failuretwin.connection.emulated_arm import Emulation
 
@@ -132,22 +125,14 @@ def _of_size(mode: FaultMode, size: float, text: str) -> FaultMode:
 
 
 def is_moved(arm: ArmOptions) -> bool:
-    """Return whether orders are sent to an arm: emulated arms need no --move.
-
-    Raises:
-        InputError: If its place is none of `PLACES`.
-    """
+    """Return whether orders are sent to an arm: emulated arms need no --move."""
     if arm.place != EMULATED and not is_network(arm.place):
         raise InputError(f"--on is {arm.place!r}, expected {PLACES}.")
     return arm.move or arm.place == EMULATED
 
 
 def commander_of(arm: ArmOptions, known: CalibratedRobot, seed: int, stack: ExitStack) -> Commander:
-    """Return the arm that a command moves; the stack closes it.
-
-    Raises:
-        InputError: If it cannot be reached or its place is none of `PLACES`.
-    """
+    """Return the arm that a command moves; the stack closes it."""
     is_moved(arm)
     if arm.place == EMULATED:
         return stack.enter_context(emulated_arm(known, arm.faults, seed))
@@ -182,10 +167,6 @@ def connect(
 
     The stack closes them. With `takes_orders` the source must be a `Commander`; an emulated arm
     then works in shifts, and takes orders in its breaks.
-
-    Raises:
-        InputError: If it does not exist, cannot be reached, is none of `SOURCES`, takes no orders,
-            or gets options that only an emulated robot has.
     """
     if text == EMULATED:
         return stack.enter_context(_emulated(robot, live, seed, takes_orders)), []
@@ -234,11 +215,7 @@ def _log(text: str, robot: Robot, topics: RosTopics, pace: Pace) -> Source:
 
 
 def number_of(value: str, what: str) -> float:
-    """Return the finite number that a text holds.
-
-    Raises:
-        InputError: If it holds none; the message begins with `what`.
-    """
+    """Return the finite number that a text holds."""
     try:
         number = float(value)
     except ValueError:
@@ -249,11 +226,7 @@ def number_of(value: str, what: str) -> float:
 
 
 def held_of(text: str, robot: Robot) -> tuple[str, float]:
-    """Return motor and angle [rad] or position [m] in ``MOTOR:stuck=SIZE``.
-
-    Raises:
-        InputError: If it is not of that form or names no motor of the robot.
-    """
+    """Return motor and angle [rad] or position [m] in ``MOTOR:stuck=SIZE``."""
     name, _, size = text.partition("=")
     fault = Hypothesis.parse(name, robot.motor_names).faults
     if len(fault) != 1 or fault[0].mode != "stuck" or not size:
@@ -273,9 +246,6 @@ def spared_of(
 
     Texts (MOTOR or MOTOR=WEIGHT) replace the weights from the rows of a history, whose wear is
     told.
-
-    Raises:
-        InputError: If a motor is unknown or a weight is no number.
     """
     names = model.motor_names
     weight = np.zeros(len(names))

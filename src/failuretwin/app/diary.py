@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from failuretwin.app.terminal import tell
 from failuretwin.core.errors import InputError, counted
-from failuretwin.decision.acting.alarm import AlarmChange
+from failuretwin.decision.acting.session import AlarmChange
 from failuretwin.decision.acting.task import TargetResult
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 

@@ -34,12 +34,7 @@ POLL_S = 0.01
 
 
 def obey(target: str, emulation: Emulation, live: LiveOptions) -> None:
-    """Publish readings and carry out the commands of a network, until interrupted.
-
-    Raises:
-        InputError: If the target is no network, or cannot be reached, or time passes at another
-            speed than that of the programs that stamp the commands.
-    """
+    """Publish readings and carry out the commands of a network, until interrupted."""
     if not is_network(target):
         raise InputError(f"--obey needs a network to obey, but --to is {target!r}.")
     if live.speed != 1.0:
@@ -65,11 +60,7 @@ def obey(target: str, emulation: Emulation, live: LiveOptions) -> None:
 
 
 def play(target: str, emulation: Emulation, live: LiveOptions) -> None:
-    """Publish or record a robot that moves at random.
-
-    Raises:
-        InputError: If the target is no network and no .mcap file, or fails.
-    """
+    """Publish or record a robot that moves at random."""
     zero, on_network = time.time(), is_network(target)
     if not on_network and Path(target).suffix != ".mcap":
         places = ", ".join(NETWORKS)

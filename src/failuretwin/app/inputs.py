@@ -48,18 +48,7 @@ def read_inputs(
     columns: Path | None,
     workforce: Workforce | None = None,
 ) -> xr.Dataset:
-    """Return the runs of all logs as one run set, read with the map of `columns` if there is one.
-
-    Args:
-        logs: The logs.
-        robot: The robot that they are of.
-        options: How they become runs.
-        columns: The map; None: there is none.
-        workforce: Processes that read them; None: this one.
-
-    Raises:
-        InputError: If they cannot be read.
-    """
+    """Return the runs of all logs as one run set, read with the map of `columns`, if any."""
     options, correction = with_map(options, columns, logs, robot)
     found = find_logs(logs, options)
     with progress_bar("reading logs", len(found)) as advance:
@@ -105,11 +94,7 @@ def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
 def with_map(
     options: ReadOptions, path: Path | None, logs: Sequence[Path], robot: Robot
 ) -> tuple[ReadOptions, LogCorrection | None]:
-    """Return the options with a map of columns, topics or angles, and the correction in it.
-
-    Raises:
-        InputError: If the map cannot be read. If there is no such file yet, a guess is written.
-    """
+    """Return the options with a map of columns, topics or angles, and the correction in it."""
     if path is None:
         return options, None
     if not path.exists():
@@ -132,11 +117,7 @@ def with_map(
 
 
 def stated_angles(path: Path | None) -> LeRobotAngles | None:
-    """Return what a map, or a calibration file of LeRobot (.json), states of angles; None: nothing.
-
-    Raises:
-        InputError: If the file cannot be read.
-    """
+    """Return the angles that a map or a calibration file of LeRobot (.json) states, if any."""
     if path is not None and path.suffix == ".json":
         return LeRobotAngles(calibration=str(path))
     table = {} if path is None else read_toml(path)
@@ -184,11 +165,7 @@ BLEND = f"{BAYES}+"
 
 
 def parse_cli_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ...] | None:
-    """Return the hypotheses of a text separated by commas; None: the default ones.
-
-    Raises:
-        InputError: If one cannot be read, or there is only one, which is always certain.
-    """
+    """Return the hypotheses of a text separated by commas; None: the default ones."""
     if text is None:
         return None
     try:
@@ -208,14 +185,8 @@ def parse_cli_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ..
 def chosen_diagnoser(method: str, bayes: BayesDiagnoser) -> Diagnoser:
     """Return the diagnoser of `--method`.
 
-    Args:
-        method: ``bayes``, the file of a network, ``bayes+`` and that file, or ``module:Class`` of
-            the user's own.
-        bayes: The Bayesian diagnoser.
-
-    Raises:
-        InputError: If the file is no network for this robot or was never fitted to be blended, the
-            extra `learn` is missing, or there is no such class.
+    It is ``bayes``, the file of a network, ``bayes+`` and that file, or ``module:Class`` of the
+    user's own.
     """
     if method == BAYES:
         return bayes

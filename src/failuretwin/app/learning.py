@@ -110,12 +110,7 @@ def found_in(
 ) -> Findings:
     """Return diagnoses of runs.
 
-    Args:
-        runs: The runs.
-        bayes: The Bayesian diagnoser.
-        diagnoser: What diagnoses runs that teach nothing.
-        tracking: What learns run by run; None: nothing does.
-        start: What learning from all runs at once begins with; None: nothing learns so.
+    `tracking` learns run by run, `start` begins to learn from all runs at once; None: neither.
     """
     if tracking is not None:
         return tracking.diagnose(runs)
@@ -125,12 +120,7 @@ def found_in(
 
 
 def self_calibrated(runs: xr.Dataset, bayes: BayesDiagnoser, start: Start) -> Findings:
-    """Return diagnoses that learn the robot from all runs at once.
-
-    Raises:
-        InputError: If nothing can be learned.
-        OutputError: If the calibration cannot be written.
-    """
+    """Return diagnoses that learn the robot from all runs at once."""
     robot, out, calibration = bayes.twin.robot, start.out, start.calibration
     if out is not None:
         begun = calibration is not None and calibration.resolve() == out.resolve()
@@ -155,32 +145,24 @@ class Tracking:
     """Diagnosis run by run, which goes on from the history of a robot.
 
     The history lies in the store, beside the calibration, or beside `start.out`.
-
-    Args:
-        bayes: How to diagnose.
-        start: What it begins with.
-
-    Raises:
-        InputError: If there are two places for the history, or it cannot be read.
     """
 
     def __init__(self, bayes: BayesDiagnoser, start: Start) -> None:
-        self._bayes = bayes
-        self._out = start.out
-        stored = start.stored
-        self._keeper = None if stored is None else _keeper_of(stored)
+        self._bayes, self._out = bayes, start.out
         if start.out is not None:
-            _check_out(start, bayes.twin.robot)
-        self._history = self._opened(start)
-
-    def _opened(self, start: Start) -> History:
-        begun = begin(self._bayes, start.cold)
-        if self._keeper is not None:
-            return self._keeper.history(begun, start.cold)
+            _check_out(start.out, start, bayes.twin.robot)
+        begun = begin(bayes, start.cold)
+        self._keeper: LifeKeeper | None = None
         beside = start.out if start.cold else start.calibration
-        if beside is None:
-            return History(begun, start.cold)
-        return open_history(beside, begun, start.cold)
+        if start.stored is not None:
+            from failuretwin.app.life_keeper import LifeKeeper  # needs the extra `store`
+
+            self._keeper = LifeKeeper(start.stored, "diagnose")
+            self._history = self._keeper.history(begun, start.cold)
+        elif beside is not None:
+            self._history = open_history(beside, begun, start.cold)
+        else:
+            self._history = History(begun, start.cold)
 
     def diagnose(self, runs: xr.Dataset) -> Findings:
         """Return diagnoses of runs, each by those before it."""
@@ -198,21 +180,14 @@ class Tracking:
             keep_history(found.history, found.life, found.rows)
 
 
-def _keeper_of(stored: RobotRecord) -> LifeKeeper:
-    from failuretwin.app.life_keeper import LifeKeeper  # needs the extra `store`
-
-    return LifeKeeper(stored, "diagnose")
-
-
-def _check_out(start: Start, robot: Robot) -> None:
-    """Raise InputError unless `start.out` is the one place for what is learned."""
+def _check_out(out: Path, start: Start, robot: Robot) -> None:
+    """Raise InputError unless `out` is the one place for what is learned."""
     if not start.cold:
         raise InputError(
             "--track keeps what it learns beside the calibration that it began with. Leave out "
             "--out, or --calibration to begin with the arm class."
         )
-    if start.out is not None:
-        check_calibration_file(start.out, robot, learned_name(robot))
+    check_calibration_file(out, robot, learned_name(robot))
 
 
 def ruled_out_note(

@@ -16,7 +16,7 @@ from failuretwin.data_knowledge.run_pieces import PIECE, RunPieces
 from failuretwin.data_knowledge.workers import Workforce
 from failuretwin.decision.chunked_diagnosis import diagnose_to_parquet
 from failuretwin.decision.evaluation import Judged
-from failuretwin.decision.parquet_results import read_diagnoses
+from failuretwin.decision.results import read_diagnoses
 from failuretwin.decision.scoring import NO_VERDICT
 from failuretwin.inference.diagnoser import BayesDiagnoser
 
@@ -32,12 +32,7 @@ STATES = (HEALTHY_STATE, FAULTY_STATE, OPEN_STATE)
 def diagnose_many(
     reading: LogOptions, bayes: BayesDiagnoser, folder: Path, workforce: Workforce
 ) -> list[Part]:
-    """Diagnose runs of any number into a folder of parquet files, and return a summary.
-
-    Raises:
-        InputError: If runs cannot be read, or the workforce cannot be had.
-        OutputError: If the results cannot be written.
-    """
+    """Diagnose runs of any number into a folder of parquet files, and return a summary."""
     robot = bayes.twin.robot
     options, correction = with_map(reading.options, reading.columns, reading.logs, robot)
     runs = RunPieces(reading.logs, robot, options)
@@ -58,11 +53,7 @@ def diagnose_many(
 def remember_many(
     stored: RobotRecord, folder: Path, reading: LogOptions, recorded: datetime | None
 ) -> str:
-    """Store the diagnoses in a folder of results piece by piece, and return a line.
-
-    Raises:
-        OutputError: If they cannot be stored.
-    """
+    """Store the diagnoses in a folder of results piece by piece, and return a line."""
     from failuretwin.data_knowledge.records.log_files import log_file  # needs the extra `store`
 
     log = log_file(reading.logs[0], recorded)

@@ -51,12 +51,7 @@ def offset_lines(
     reading: LogOptions,
     out: Path | None,
 ) -> list[str]:
-    """Return lines on the offsets in LeRobot data, and write a corrected copy to `out`, if any.
-
-    Raises:
-        InputError: If there is nothing to correct.
-        OutputError: If the copy cannot be written.
-    """
+    """Return lines on the offsets in LeRobot data, and write a corrected copy to `out`, if any."""
     if not str(runs.attrs.get("source", "")).startswith("LeRobot"):
         return []
     offsets = _offsets(runs, known, diagnoses)
@@ -93,12 +88,7 @@ def _corrected(
     log: Path, out: Path, robot: Robot, angles: LeRobotAngles | None,
     offsets: Sequence[JointOffset],
 ) -> str:  # fmt: skip
-    """Write a copy of a data set without the offsets that are found; return a line on it.
-
-    Raises:
-        InputError: If none is found.
-        OutputError: If it cannot be written.
-    """
+    """Write a copy of a data set without the offsets that are found; return a line on it."""
     found = [offset for offset in offsets if offset.found]
     if not found:
         largest = max(offsets, key=lambda offset: offset.probability, default=None)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from failuretwin.app.commands.options import LogOptions
     from failuretwin.data_knowledge.workers import Workforce
-    from failuretwin.decision.acting.alarm import AlarmChange
+    from failuretwin.decision.acting.session import AlarmChange
     from failuretwin.decision.test_motions.health_check import CheckResult
 
 

@@ -99,11 +99,7 @@ def _on_terminal(table: Table) -> TerminalTable:
 
 
 def write_json(records: Iterable[Mapping[str, Any]], path: Path | None) -> None:
-    """Write JSON objects, one a line; None: nothing is written.
-
-    Raises:
-        OutputError: If they cannot be written.
-    """
+    """Write JSON objects, one a line; None: nothing is written."""
     from failuretwin.data_knowledge.store import write_records
 
     if path is not None:

@@ -69,11 +69,7 @@ def _bounds_of(cls: type) -> list[tuple[str, Bounds]]:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Return the table in a TOML file.
-
-    Raises:
-        InputError: If the file cannot be read or is not TOML.
-    """
+    """Return the table in a TOML file."""
     text = read_text(path, "text", "Expected a TOML file.")
     try:
         return tomllib.loads(text)
@@ -84,16 +80,13 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
-    """Return `table` as the dataclass `cls`; keys and types are checked recursively.
+    """Return a table of TOML or JSON as the dataclass `cls`, keys and types checked recursively.
 
     Args:
         cls: A dataclass; fields may be numbers, text, booleans, tuples, dictionaries of text to
             numbers, dataclasses, tuples of dataclasses, or any of these or None.
-        table: Keys and values as read from TOML.
+        table: Keys and values as read from the file.
         where: Name of the file and table for error texts.
-
-    Raises:
-        InputError: For an unknown or missing key, a wrong type, or a value that `cls` refuses.
     """
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
     for key in table:
@@ -120,14 +113,16 @@ def _required(field: dataclasses.Field[Any]) -> bool:
 def _convert(hint: Any, value: Any, where: str) -> Any:
     origin, args = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
-        return _convert(next(a for a in args if a is not type(None)), value, where)
+        inner = next(a for a in args if a is not type(None))
+        return None if value is None else _convert(inner, value, where)
     if origin is tuple:
         return _convert_tuple(args, value, where)
-    if (dataclasses.is_dataclass(hint) or origin is dict) and not isinstance(value, dict):
+    table = origin in (dict, Mapping)
+    if (dataclasses.is_dataclass(hint) or table) and not isinstance(value, dict):
         raise _wrong(where, value, "a table")
     if dataclasses.is_dataclass(hint):
         return from_table(hint, value, where)  # type: ignore[arg-type]
-    if origin is dict:
+    if table:
         return {key: _convert(args[1], item, f"{where}.{key}") for key, item in value.items()}
     return _convert_plain(hint, value, where)
 

@@ -12,7 +12,10 @@ class FailureTwinError(Exception):
 
 
 class InputError(FailureTwinError, ValueError):
-    """Unusable input; the text says how to fix it."""
+    """Unusable input; the text says how to fix it.
+
+    Public functions list it under `Raises`; all others pass it on.
+    """
 
 
 class OutputError(FailureTwinError, OSError):
@@ -40,9 +43,6 @@ def needs_extra(who: str, extra: str) -> Iterator[None]:
     Args:
         who: Feature and library, such as ``"pictures need matplotlib"``.
         extra: The extra of this package that installs the library.
-
-    Raises:
-        InputError: If a library is missing; the text says how to install it.
     """
     try:
         yield

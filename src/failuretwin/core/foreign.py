@@ -55,9 +55,6 @@ def reading(path: Path | str, kind: str, fix: str = "") -> Iterator[None]:
         path: The file.
         kind: Expected kind of file, such as ``a MATLAB file``.
         fix: What to do about it, one sentence.
-
-    Raises:
-        InputError: For any error of a library; errors of this package pass.
     """
     try:
         yield
@@ -78,11 +75,7 @@ def check_is_file(path: Path, kind: str) -> None:
 
 
 def read_text(path: Path, kind: str, fix: str = "") -> str:
-    """Return the text of a file.
-
-    Raises:
-        InputError: If it cannot be read, is not UTF-8, or is larger than `TEXT_BYTES`.
-    """
+    """Return the text of a file."""
     with reading(path, kind, fix):
         check_is_file(path, kind)
         size = path.stat().st_size
@@ -97,10 +90,7 @@ def read_text(path: Path, kind: str, fix: str = "") -> str:
 def check_size(claimed: float, path: Path, what: str) -> None:
     """Raise InputError if reading would take more memory than file and machine allow.
 
-    Args:
-        claimed: Bytes needed, as the file declares them.
-        path: The file, or a folder of files.
-        what: Part of the file that needs them, such as ``its arrays``.
+    By its own words the file needs `claimed` bytes for `what`, such as ``its arrays``.
     """
     stored = stored_bytes(path)
     if claimed > max(LEAST_BYTES, EXPANSION * stored):

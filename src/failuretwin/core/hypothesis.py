@@ -108,16 +108,7 @@ def paper_hypotheses(motors: Sequence[str]) -> tuple[Hypothesis, ...]:
 def parse_hypotheses(
     given: Iterable[Hypothesis | str], motors: Sequence[str]
 ) -> tuple[Hypothesis, ...]:
-    """Return several hypotheses.
-
-    Args:
-        given: Hypotheses, or their text form.
-        motors: Names of the robot's motors in chain order.
-
-    Raises:
-        InputError: If one is not valid or repeated, none is given, or a text is given instead of a
-            list.
-    """
+    """Return several hypotheses."""
     if isinstance(given, str):
         raise InputError(
             f"hypotheses are the text {given!r}. Expected a list, such as ['healthy', "
@@ -214,12 +205,6 @@ class MotorResidual:
     angle: tuple[float, ...]
     direction: tuple[float, ...]
 
-    @classmethod
-    def from_fields(cls, fields: Mapping[str, Any]) -> MotorResidual:
-        """Return the residual whose `dataclasses.asdict` went through JSON."""
-        lists = {name: tuple(v) for name, v in fields.items() if name not in ("motor", "unit")}
-        return cls(fields["motor"], fields["unit"], **lists)
-
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -285,24 +270,6 @@ class Diagnosis:
     def runner_up(self) -> str | None:
         """The second most probable hypothesis; None where there is none."""
         return None if self.undecided or len(self.posterior) < 2 else self.ranked[1]
-
-    @classmethod
-    def from_fields(cls, fields: Mapping[str, Any]) -> Diagnosis:
-        """Return the diagnosis whose `dataclasses.asdict` went through JSON.
-
-        Raises:
-            TypeError: If a field is unknown or missing.
-        """
-        intervals = {
-            name: None if fields[name] is None else tuple(fields[name])
-            for name in ("onset_90", "magnitude_90")
-        }
-        evidence = tuple(MovementEvidence(**movement) for movement in fields["evidence"])
-        lines = {name: tuple(fields[name]) for name in ("explanation", "quality")}
-        told = fields.get("residual")
-        residual = None if told is None else MotorResidual.from_fields(told)
-        made = {**fields, **intervals, **lines, "evidence": evidence, "residual": residual}
-        return cls(**made)
 
     def to_record(self) -> dict[str, Any]:
         """Return the JSON object of the contract."""

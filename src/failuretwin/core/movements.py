@@ -183,9 +183,6 @@ def find_movements(command: FloatArray, time: FloatArray) -> Movements:
     Args:
         command: Reference angles, (run, time, motor) [rad].
         time: Uniform time grid, (time,) [s].
-
-    Raises:
-        InputError: If a command is not finite.
     """
     if not np.all(np.isfinite(command)):
         raise InputError(
@@ -298,9 +295,7 @@ def _merge_starts(starts: FloatArray) -> FloatArray:
 def _after_rests(start: FloatArray, moving: FloatArray) -> FloatArray:
     """Return the starts that follow a rest of all motors, and the first one.
 
-    Args:
-        start: Start of each movement, (movement,) [s].
-        moving: Start and end of every line with motion, (line, 2) [s].
+    Starts are (movement,) [s]; lines with motion are (line, 2) [s], start and end.
     """
     kept = []
     for at in start:
@@ -344,9 +339,6 @@ def movements_of_samples(command: FloatArray, time: FloatArray) -> Movements:
     Args:
         command: Reference angles, (sample, motor) [rad].
         time: Increasing times, at least two, (sample,) [s].
-
-    Raises:
-        InputError: If a command is not finite.
     """
     grid, values = _evenly(time, command)
     bends = np.abs(np.diff(values, 2, axis=0))

@@ -105,10 +105,7 @@ class Covariance(ABC):
     def of(root: FloatArray, noise: float, dims: int | None = None) -> Covariance:
         """Return S = A A^T + noise I; three dimensions in closed form, others by inversion.
 
-        Args:
-            root: A, (..., d, column).
-            noise: Variance added on each axis.
-            dims: Dimension of the density; None: d.
+        A is (..., d, column); the Student t density has d dimensions, or `dims`.
         """
         made = Ellipsoid if root.shape[-2] == 3 else DenseCovariance
         return made.of_root(root, noise, dims or root.shape[-2])
@@ -231,10 +228,7 @@ def log_norm(dof: float, dims: int = 3) -> float:
 def log_fall(square: FloatArray, dof: float, dims: int = 3) -> FloatArray:
     """Return the log density of a Student t relative to its centre, (...).
 
-    Args:
-        square: x^T S^-1 x, (...).
-        dof: nu; infinite: normal.
-        dims: d.
+    `square` is x^T S^-1 x, (...); `dof` is nu, infinite: normal; `dims` is d.
     """
     if np.isinf(dof):
         return -0.5 * square
@@ -247,11 +241,8 @@ def log_fall(square: FloatArray, dof: float, dims: int = 3) -> FloatArray:
 def log_student(error: FloatArray, root: FloatArray, noise: float, dof: float) -> FloatArray:
     """Return log t_nu(error; A A^T + noise I) in d dimensions, (...).
 
-    Args:
-        error: Deviations, (..., d).
-        root: A, (..., d, column).
-        noise: Variance added on each axis.
-        dof: nu; infinite: normal.
+    Deviations are (..., d), A is (..., d, column), and `noise` is a variance on each axis; nu
+    infinite: normal.
     """
     return Covariance.of(root, noise).log_student(error, dof)
 
@@ -259,9 +250,7 @@ def log_student(error: FloatArray, root: FloatArray, noise: float, dof: float) -
 def log_normal_2d(error: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return log N(error; 0, S) in two dimensions, (...), in closed form.
 
-    Args:
-        error: (..., 2).
-        covariance: S, (..., 2, 2).
+    The error is (..., 2), the covariance S (..., 2, 2).
     """
     (aa, ab), (_, bb) = np.moveaxis(covariance, (-2, -1), (0, 1))
     a, b = np.moveaxis(error, -1, 0)
@@ -276,9 +265,7 @@ def log_normal_2d(error: FloatArray, covariance: FloatArray) -> FloatArray:
 def masked_median(values: FloatArray, kept: BoolArray) -> FloatArray:
     """Return the median of the kept values in each row, (row,); 0 without any.
 
-    Args:
-        values: (row, value).
-        kept: Which of them count, same axes.
+    Values are (row, value), as is which of them are kept.
     """
     if values.shape[1] == 0:
         return np.zeros(len(values))

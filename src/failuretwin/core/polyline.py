@@ -79,12 +79,8 @@ def simplify_motors(
 
     Values rounded more coarsely than the tolerance form staircases, in which bends and steps look
     alike. Each motor then moves on a straight line from one common rest to its own last step before
-    the next, if this stays within a quantum and a stair and needs fewer lines.
-
-    Args:
-        time: Increasing times, (sample,) [s].
-        value: Samples, (sample, motor) [rad]; NaN = none.
-        tolerance: Largest distance from the samples [rad].
+    the next, if this stays within a quantum and a stair and needs fewer lines. Samples are (sample,
+    motor) [rad], NaN = none, at increasing times (sample,) [s].
     """
     quantum = max(resolution(column) for column in value.T)
     alone = [simplify(time, column, tolerance) for column in value.T]
@@ -104,10 +100,8 @@ def _between_rests(
 ) -> tuple[FloatArray, FloatArray]:
     """Return corners of straight lines between the common rests.
 
-    Args:
-        time: (sample,) [s].
-        value: Reference of one motor, (sample,) [rad].
-        together: References of all motors, (sample, motor) [rad].
+    References are those of one motor, (sample,) [rad], and of all `together`, (sample, motor)
+    [rad].
     """
     moves = np.abs(np.diff(together, axis=0)).max(axis=1) > TURN_RAD
     edges = np.flatnonzero(np.concatenate([[True], moves, [True]]))
@@ -181,10 +175,7 @@ def _meet(a: Corner, b: Corner, c: Corner, d: Corner) -> Corner | None:
 def _level(value: FloatArray, fixed: BoolArray, tolerance: float) -> FloatArray:
     """Return corner values with each almost level line set to the value at its start.
 
-    Args:
-        value: Corner values, (corner,).
-        fixed: Corners that change only by rounding, (corner,).
-        tolerance: Largest rise of an almost level line.
+    Values and which of them change only by rounding are (corner,).
     """
     value = value.copy()
     for i in range(1, len(value)):

@@ -111,11 +111,7 @@ class RunTable:
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dataset(self) -> xr.Dataset:
-        """Return the checked run set.
-
-        Raises:
-            InputError: If shapes or coordinates do not fit together.
-        """
+        """Return the checked run set."""
         import xarray as xr
 
         values: dict[str, Any] = {"command": self.command, "measured": self.measured}
@@ -211,15 +207,7 @@ def run_set(
 
 
 def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:
-    """Return `runs` if they satisfy the contract of a run set.
-
-    Args:
-        runs: The dataset to check.
-        where: Its name in errors, such as its path.
-
-    Raises:
-        InputError: With the first violation and the expected value.
-    """
+    """Return `runs` if they satisfy the contract of a run set."""
     check_layout(runs, where)
     _check_values(runs, where)
     check_duration(runs, where)
@@ -332,9 +320,6 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
 
     Variables missing in any part are dropped; repeated run names get a number. The lowest sensor
     rate is kept, so that no reading counts twice.
-
-    Raises:
-        InputError: If there are no parts or they differ in motors or time step.
     """
     import xarray as xr
 

@@ -113,6 +113,18 @@ class ArrayStruct:
         for (_, array, axes), (_, value, _) in zip(self._arrays(), new, strict=True):
             array[axes.of_entries(entries)] = value
 
+    def extended_by(self, *others: Self) -> Self:
+        """Return these movements with those of others behind them, all of the same runs."""
+        each = zip(*(part._arrays() for part in (self, *others)), strict=True)
+
+        def joined(array: np.ndarray, axes: Axes) -> np.ndarray:
+            parts = [part for _, part, _ in next(each)]
+            if "movement" not in axes.names:
+                return array
+            return np.concatenate(parts, axis=axes.names.index("movement"))
+
+        return self._with(joined)
+
     def forget_oldest(self, run: int) -> None:
         """Drop the first movement of a run; the last place becomes empty."""
         for _, array, axes in self._arrays():

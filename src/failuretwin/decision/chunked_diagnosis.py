@@ -21,7 +21,7 @@ from failuretwin.data_knowledge.readers.read import ReadOptions
 from failuretwin.data_knowledge.run_pieces import RunPieces
 from failuretwin.data_knowledge.store import atomic_replace, check_fillable
 from failuretwin.data_knowledge.workers import Workforce
-from failuretwin.decision.parquet_results import (
+from failuretwin.decision.results import (
     check_parquet,
     part_name,
     read_names,

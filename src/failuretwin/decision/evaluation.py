@@ -54,11 +54,7 @@ class Truths:
 
     @classmethod
     def of(cls, runs: xr.Dataset, name: str = "the run set") -> Truths:
-        """Return the truth of every run of a run set.
-
-        Raises:
-            InputError: If the run set has no truth.
-        """
+        """Return the truth of every run of a run set."""
         faults = truth_of(runs)
         if faults is None:
             raise InputError(
@@ -113,11 +109,7 @@ class Judged:
 
     @classmethod
     def of(cls, results: Given, truths: Truths | None = None) -> Judged:
-        """Judge diagnoses by `truths`; None: by the truth that they carry.
-
-        Raises:
-            InputError: If the truth of a run is not among `truths`.
-        """
+        """Judge diagnoses by `truths`; None: by the truth that they carry."""
         given = as_results(results).diagnoses
         known = [d.truth if truths is None else truths[d.run].fault for d in given]
         pairs = [(d, true) for d, true in zip(given, known, strict=True) if true]

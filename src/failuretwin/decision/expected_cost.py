@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
@@ -73,11 +74,7 @@ class Costs(Bounded):
     currency: str = ""
 
     def missed_by(self, fault: Fault) -> Missed:
-        """Return the shares of a fault.
-
-        Raises:
-            InputError: If neither its mode nor `any` has a row.
-        """
+        """Return the shares of a fault."""
         row = self.missed.get(fault.mode, self.missed.get(ANY))
         if row is None:
             raise InputError(
@@ -87,12 +84,13 @@ class Costs(Bounded):
         return row
 
 
-def load_costs(path: str | Path) -> Costs:
-    """Load the user's costs from a TOML file; see `TEMPLATE`.
+def costs_template() -> str:
+    """Return a file of costs to be filled in; none is shipped as truth."""
+    return (files("failuretwin.decision") / "costs.template").read_text(encoding="utf-8")
 
-    Raises:
-        InputError: If it cannot be read, lacks a figure or holds one that makes no sense.
-    """
+
+def load_costs(path: str | Path) -> Costs:
+    """Load the user's costs from a TOML file; see `costs_template`."""
     return from_table(Costs, read_toml(Path(path)), str(path))
 
 
@@ -223,37 +221,3 @@ def _hinge(difference: FloatArray, probability: FloatArray) -> tuple[int, float]
     away = np.where((t >= 0.0) & (t <= 1.0), np.abs(t - probability), np.inf)
     best = int(np.argmin(away))
     return (best, float(t[best])) if np.isfinite(away[best]) else (-1, np.nan)
-
-
-TEMPLATE = """\
-# What things cost you, in any currency. Every number here is a blank to be filled in, not a fact.
-
-currency = "EUR"
-targets = 100          # targets until the next time that something can be decided
-missed_target = 1.0    # cost of one target that is missed
-compensate = 5.0       # price of working on with `failuretwin act`: slower, watched
-slow_down = 5.0        # price of working on slowly
-inspect = 10.0         # price of finding out for sure
-replace = 40.0         # price of a new motor, built in
-stop = 60.0            # price of standing still until then
-
-[healthy]              # share of targets that a healthy arm misses, 0 to 1
-going_on = 0.0
-compensating = 0.0
-slowly = 0.0
-
-# Share of targets missed with a fault: as if nothing were wrong, with `act`, slowly.
-# `failuretwin reach` says for a held motor what `act` can reach; docs/acting.md has more figures.
-# [missed.any] is for every mode that has no table of its own.
-
-[missed.any]
-going_on = 0.5
-compensating = 0.2
-slowly = 0.5
-
-[missed.stuck]
-going_on = 0.9
-compensating = 0.4
-slowly = 0.9
-"""
-"""A file of costs to be filled in; none is shipped as truth."""

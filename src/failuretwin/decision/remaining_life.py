@@ -251,11 +251,6 @@ def motor_lives(
 
     The unit of wear is the scatter of the motor. Runs with an alarm are left out. None: too few
     runs show the wear of a motor.
-
-    Args:
-        rows: Runs of the history.
-        model: The healthy robot as it was calibrated.
-        rng: Source of chance.
     """
     names = model.motor_names
     scatter = wear_unit(model)[: len(names)]

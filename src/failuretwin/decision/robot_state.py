@@ -174,9 +174,6 @@ def robot_state(
         robot: The robot.
         course: Fault course of runs diagnosed together; None: diagnosed independently.
         learned: Sentences on what the runs taught about the robot; None: nothing was learned.
-
-    Raises:
-        InputError: If there is no run.
     """
     if not diagnoses:
         raise InputError("a state needs the diagnosis of one run at least; there is none.")

@@ -284,11 +284,7 @@ def adaptive_edges(confidence: FloatArray) -> FloatArray:
 def reliability(
     confidence: FloatArray, right: BoolArray, edges: FloatArray = EQUAL_EDGES
 ) -> Reliability:
-    """Return the reliability diagram of stated probabilities and whether each was right, (run,).
-
-    Raises:
-        InputError: If there are no runs or a value is not a probability.
-    """
+    """Return the reliability diagram of stated probabilities and whether each was right, (run,)."""
     if not confidence.size or not np.all((confidence >= 0.0) & (confidence <= 1.0)):
         raise InputError("expected the stated probability of at least one run, within 0 to 1.")
     inside, bins = np.searchsorted(edges[1:-1], confidence, side="left"), len(edges) - 1

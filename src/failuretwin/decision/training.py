@@ -86,17 +86,15 @@ class TrainingData:
         robot: The robot.
         imperfections: Its healthy behaviour, with the variation between robots.
         seed: Random seed.
-        variants: Kinds of runs, equally frequent.
         engine: Simulation engine; see `Plan`.
         hypotheses: The classes; empty: the paper's.
-        modes: Fault modes by id, which other processes would not have registered; variants
+        modes: Fault modes by id, which other processes would not have registered; `VARIANTS`
             override magnitude and onset of the paper's modes.
     """
 
     robot: Robot
     imperfections: Imperfections
     seed: int = 0
-    variants: tuple[Variant, ...] = VARIANTS
     engine: str = "servo"
     hypotheses: tuple[Hypothesis, ...] = ()
     modes: Mapping[str, FaultMode] = field(default_factory=lambda: dict(MODES))
@@ -132,8 +130,8 @@ class TrainingData:
     def _made(self, number: int, runs: int) -> Iterator[tuple[IntArray, RunTable]]:
         """Yield the runs of each variant with their indices in the chunk."""
         classes = self._classes(number, runs)
-        for kind, variant in enumerate(self.variants):
-            places = np.arange(kind, runs, len(self.variants))
+        for kind, variant in enumerate(VARIANTS):
+            places = np.arange(kind, runs, len(VARIANTS))
             if len(places):
                 numbers = [
                     int(classes[i]) * RUNS_PER_CLASS + number * runs + int(i) for i in places
@@ -194,11 +192,6 @@ AHEAD = 2
 """Chunks prepared in advance by each process."""
 
 
-def cores() -> int:
-    """Return the number of processes that this machine runs at a time."""
-    return os.cpu_count() or 1
-
-
 @dataclass(frozen=True)
 class _Chunks(Dataset[Batch]):
     """Chunks of simulated runs by number."""
@@ -231,15 +224,12 @@ class Stream:
         """Yield chunks of new runs without end, in order.
 
         Scripts must be guarded by ``if __name__ == "__main__":``.
-
-        Raises:
-            FailureTwinError: If one of the processes ends.
         """
         loader: DataLoader[Batch] = DataLoader(
             _Chunks(self.data, self.encoder, CHUNK_RUNS),
             batch_size=None,
             sampler=count(),
-            num_workers=max(1, cores() - 1),
+            num_workers=max(1, (os.cpu_count() or 1) - 1),
             prefetch_factor=AHEAD,
             collate_fn=tuple,  # arrays, not tensors
             multiprocessing_context="spawn",

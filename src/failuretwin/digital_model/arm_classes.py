@@ -74,11 +74,7 @@ def class_of(robot: Robot) -> ArmClass:
 
 
 def class_name(robot: Robot) -> str:
-    """Return the class of an arm: stated in its profile, else by its reach.
-
-    Raises:
-        InputError: If the profile names an unknown class.
-    """
+    """Return the class of an arm: stated in its profile, else by its reach."""
     name = robot.profile.arm_class
     if not name:
         return "industrial" if robot.reach > LONG_ARM_M else "hobby servo"
@@ -88,11 +84,7 @@ def class_name(robot: Robot) -> str:
 
 
 def generic_imperfections(robot: Robot) -> Imperfections:
-    """Return the imperfections of a typical arm of this class, for an uncalibrated robot.
-
-    Raises:
-        InputError: If the profile names an unknown class.
-    """
+    """Return the imperfections of a typical arm of this class, for an uncalibrated robot."""
     name, kind, motors = class_name(robot), class_of(robot), len(robot.motors)
     load = np.sqrt(np.mean(loads_in_range(robot, 0.0) ** 2, axis=0))
     loaded = load > LEAST_LOAD * max(float(load.max()), LEAST_LOAD)

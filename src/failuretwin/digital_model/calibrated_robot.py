@@ -96,12 +96,7 @@ HealthyLike = Imperfections | Learned | str | Path | None
 def calibrated(robot: RobotLike, healthy: HealthyLike = None) -> CalibratedRobot:
     """Return a robot with its healthy behaviour.
 
-    Args:
-        robot: The robot; a `CalibratedRobot` is returned unchanged where `healthy` is None.
-        healthy: Its differences from the twin.
-
-    Raises:
-        InputError: If there is no such robot or calibration, or they do not belong together.
+    A `CalibratedRobot` is returned unchanged where nothing is said of its healthy behaviour.
     """
     if isinstance(robot, CalibratedRobot) and healthy is None:
         return robot
@@ -114,11 +109,7 @@ def calibrated(robot: RobotLike, healthy: HealthyLike = None) -> CalibratedRobot
 
 
 def with_loops(robot: Robot, loops: Sequence[CalibratedLoop]) -> Robot:
-    """Return a robot with other servo loops and speed limits for some of its motors.
-
-    Raises:
-        InputError: If the robot does not have such a motor.
-    """
+    """Return a robot with other servo loops and speed limits for some of its motors."""
     found = {loop.motor: loop for loop in loops}
     for name in found:
         if name not in robot.motor_names:
@@ -160,17 +151,7 @@ def load_calibration(
 def calibration_from_table(
     table: dict[str, Any], robot: Robot, path: Path | str
 ) -> CalibratedRobot:
-    """Return a robot with the calibration of a TOML table.
-
-    Args:
-        table: Contents of a calibration file.
-        robot: The robot.
-        path: File or place of the table, for texts.
-
-    Raises:
-        InputError: If the table is no calibration, belongs to another robot or does not fit its
-            motors.
-    """
+    """Return a robot with the calibration of a TOML table."""
     table = dict(table)
     record = _record(table.pop(CALIBRATION_TABLE, {}), path)
     if record.robot not in ("", robot.name):

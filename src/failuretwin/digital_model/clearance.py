@@ -48,10 +48,8 @@ class Clearance:
     ) -> Clearance:
         """Return the clearance of a robot.
 
-        Args:
-            robot: The robot.
-            radius_m: Radius of its links [m]; None: by its reach.
-            floor_m: Height of the floor [m]; None: the base, or the lowest joint if it is lower.
+        The radius of its links [m] is by its reach where none is given; the floor is the base, or
+        the lowest joint if it is lower.
         """
         if radius_m is None:
             radius_m = RADIUS_OF_REACH * robot.reach

@@ -69,12 +69,7 @@ def draw_disturbances(
 ) -> Disturbances:
     """Return the disturbances of one run.
 
-    Args:
-        imperfections: Imperfections of the robot.
-        robot: The robot.
-        movements: Number of movements in the run.
-        duration: Time for which readings are needed [s].
-        rng: The run's own generator.
+    Readings are needed for `duration` [s]; the generator is the run's own.
     """
     imperfections = vary(imperfections, rng)
     timing, motors = imperfections.timing, len(robot.motors)
@@ -155,11 +150,7 @@ def delay_commands(movements: Movements, late: FloatArray) -> Movements:
     """Return the commanded movements when each late start also delays all later ones.
 
     A stalled bus blocks the sender: the command keeps its early stamp, the next one is sent a full
-    period after the late start.
-
-    Args:
-        movements: The undisturbed schedule.
-        late: Late start of each movement, (run, movement) [s].
+    period after the late start. Late starts are (run, movement) [s].
     """
     before = np.cumsum(late, axis=1) - late
     return replace(movements, start=movements.start + before)
@@ -169,11 +160,7 @@ def actual_movements(movements: Movements, chance: Disturbances) -> Movements:
     """Return the actual movements of the motors, without gravity sag.
 
     Lost commands, bias, friction and scatter change targets; late starts, delay and early ramp ends
-    change times.
-
-    Args:
-        movements: As commanded (after any fault that changes targets).
-        chance: Disturbances of the same runs.
+    change times. Movements are as commanded, after any fault that changes targets.
     """
     initial = here = movements.initial + chance.bias + chance.scatter[:, 0]
     target, commanded = np.empty_like(movements.target), movements.initial
@@ -194,10 +181,8 @@ def actual_movements(movements: Movements, chance: Disturbances) -> Movements:
 def lagged(reference: FloatArray, time: FloatArray, lag: FloatArray) -> FloatArray:
     """Return references behind a first-order lag, exact for lines between samples.
 
-    Args:
-        reference: (run, time, motor) [rad], at rest at its first value.
-        time: Uniform grid, (time,) [s].
-        lag: Time constant of each run, (run,) [s]; 0 leaves a run unchanged.
+    References are (run, time, motor) [rad], at rest at their first value; time constants are (run,)
+    [s], 0 leaves a run unchanged.
     """
     if not lag.any():
         return reference

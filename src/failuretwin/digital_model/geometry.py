@@ -72,11 +72,7 @@ class Geometry(Bounded):
     source: str = ""
 
     def apply(self, urdf: Urdf) -> Urdf:
-        """Return the URDF with corrected joints.
-
-        Raises:
-            InputError: If it has no such joint.
-        """
+        """Return the URDF with corrected joints."""
         return urdf.with_joints({c.joint: c.apply for c in self.joints})
 
 
@@ -120,10 +116,8 @@ def with_tool(chain: SerialChain, tool_xyz: Triple) -> SerialChain:
 def seen_chain(chain: SerialChain, base_xyz_rpy: Pose, scale: float = 1.0) -> SerialChain:
     """Return the chain to the tool point in the sensor's frame and scale.
 
-    Args:
-        chain: The chain from the base link; with sliding joints the scale must be 1.
-        base_xyz_rpy: Pose of the base link in the sensor's frame.
-        scale: Length that the sensor reports for a metre.
+    `base_xyz_rpy` is the pose of the base link in the sensor's frame; with sliding joints the scale
+    must be 1.
     """
     if base_xyz_rpy == NOT_MOVED and scale == 1.0:
         return chain
@@ -138,13 +132,9 @@ def geometry_columns(chain: SerialChain, q: FloatArray, scale: float = 1.0) -> F
 
         dp/dxyz_j = scale R_j,    dp/drpy_j[k] = R_j[:, k] x (p - p_j)
 
-    R_j and p_j are the rotation and origin of joint j's URDF frame before the joint moves, p is
-    the tool position. To first order `JointCorrection(xyz=..., rpy=...)` has this effect.
-
-    Args:
-        chain: The chain as the sensor sees it; see `seen_chain`.
-        q: Joint values in chain order, (..., joint) [rad or m].
-        scale: Length that the sensor reports for a metre.
+    R_j and p_j are the rotation and origin of joint j's URDF frame before the joint moves, p is the
+    tool position. To first order `JointCorrection(xyz=..., rpy=...)` has this effect. The chain is
+    as the sensor sees it, see `seen_chain`; joint values are (..., joint) [rad or m].
 
     Returns:
         (..., 3, 6 * joint): x, y, z [m/m] and roll, pitch, yaw [m/rad] of the first joint, then of

@@ -199,10 +199,7 @@ def tool_points(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the tool point and its Jacobian, and those of a second point along z of the tool.
 
-    Args:
-        chain: The chain.
-        q: Joint values in chain order, (..., joint) [rad or m].
-        pointer_m: Distance of the second point [m]; 0: none.
+    Joint values are (..., joint) [rad or m]; the second point is `pointer_m` away [m], 0: none.
 
     Returns:
         (..., 3 or 6) [m] and (..., 3 or 6, joint) [m/rad or m/m].
@@ -260,10 +257,8 @@ def feedback_factor(jacobian: FloatArray) -> FloatArray:
         rho_k = (J+)_k J_k
 
     With motor k held, nominal corrections dq = J+ r leave J_k (J+)_k r, a matrix of rank one: each
-    step leaves rho_k of the last error. Near 1, feedback alone does not converge.
-
-    Args:
-        jacobian: Of the tool position, (..., 3, motor) [m/rad].
+    step leaves rho_k of the last error. Near 1, feedback alone does not converge. The Jacobian is
+    that of the tool position, (..., 3, motor) [m/rad].
     """
     inverse = np.linalg.pinv(jacobian)
     return np.asarray(np.einsum("...ka,...ak->...k", inverse, jacobian))

@@ -162,8 +162,7 @@ class SerialChain:
     def frames(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the frames of all joints, before each moves, and of the tool, in the base frame.
 
-        Args:
-            q: Joint values in chain order, (..., joint) [rad or m].
+        Joint values are in chain order, (..., joint) [rad or m].
 
         Returns:
             Rotations (..., joint + 1, 3, 3), whose third column is the joint's axis, and origins
@@ -195,10 +194,8 @@ class SerialChain:
     def rotation_and_derivative(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the tool's rotation R (..., 3, 3) in the base frame and dR/dq (..., 3, 3, joint).
 
-        dR/dq_j = [axis_j]x R [1/rad]; 0 for a joint that slides.
-
-        Args:
-            q: Joint values in chain order, (..., joint) [rad or m].
+        dR/dq_j = [axis_j]x R [1/rad]; 0 for a joint that slides. Joint values are in chain order,
+        (..., joint) [rad or m].
         """
         frames, lead = self.frames_by_joint(q), np.shape(q)[:-1]
         turns = np.array([float(not joint.prismatic) for joint in self.joints])

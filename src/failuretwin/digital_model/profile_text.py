@@ -23,8 +23,8 @@ from failuretwin.digital_model.geometry import Geometry, JointCorrection
 from failuretwin.digital_model.kinematics import has_range
 from failuretwin.digital_model.profile import Profile
 from failuretwin.digital_model.robot import bundled_folder
+from failuretwin.digital_model.urdf.check import JointReport, UrdfReport
 from failuretwin.digital_model.urdf.file import UrdfJoint
-from failuretwin.digital_model.urdf.report import JointReport, UrdfReport
 
 Numbers = TypeVar("Numbers", bound=tuple[float, ...])
 
@@ -47,9 +47,6 @@ def fitted_text(text: str, old: Path, new: Path, profile: Profile) -> str:
         old: Its path.
         new: Path of the result; files are named relative to it.
         profile: Contents of the result, with files as `old` names them.
-
-    Raises:
-        InputError: If the text cannot be changed line by line.
     """
     moved = _moved(rounded(profile), old.parent, new.parent)
     lines = _without_own_tables(text.splitlines())
@@ -201,13 +198,8 @@ LONGEST_RAMP_S = 1.0
 def profile_text(report: UrdfReport, profile: Path, home: Sequence[float] = ()) -> str:
     """Return a TOML profile for the robot of a URDF.
 
-    Args:
-        report: Report on the URDF, without errors.
-        profile: Path of the profile; it names the URDF relative to its own folder.
-        home: Rest angle of each motor [rad or m]; empty: the middle of its limits.
-
-    Raises:
-        InputError: If the report holds an error, or the number of angles is not that of the motors.
+    The profile names the URDF relative to its own folder. Without rest angles `home` [rad or m],
+    motors rest in the middle of their limits.
     """
     report.raise_errors()
     if home and len(home) != len(report.motors):

@@ -254,10 +254,7 @@ def _check_unique(names: Sequence[str], kind: str, path: Path) -> None:
 def shown_unit(unit: str, robot: Robot, motor: str = "") -> tuple[float, str]:
     """Return factor and name of the unit that people read: servo counts or degrees for angles.
 
-    Args:
-        unit: That of the figure; angles in radians.
-        robot: The robot.
-        motor: The motor that the figure is of; of one that slides, millimetres.
+    Angles are in radians; of a motor that slides, millimetres are shown.
     """
     if motor and robot.own_unit(motor, unit) != unit:
         return 1e3, unit.replace("rad", "mm", 1)

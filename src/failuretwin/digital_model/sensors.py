@@ -362,13 +362,7 @@ SENSORS: Mapping[str, type[Sensor]] = {
 def sensor_of(kind: str, twin: DigitalTwin, *profiles: tuple[SensorProfile, ...]) -> Sensor:
     """Return a sensor of an arm.
 
-    Args:
-        kind: Its name.
-        twin: Kinematics of the arm.
-        profiles: Groups of sensor profiles; the first one of this kind applies.
-
-    Raises:
-        InputError: If there is no such kind.
+    The first profile of this kind in the groups applies.
     """
     if kind not in SENSORS:
         raise unknown_name("sensor", kind, SENSORS)

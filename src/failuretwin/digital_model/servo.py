@@ -33,9 +33,6 @@ class ServoLoop(Bounded):
         P: Proportional gain [-].
         I: Integral gain [1/s].
         filter_s: Time constant tau of the input filter [s].
-
-    Raises:
-        InputError: If the loop does not reach its command or is unstable.
     """
 
     P: AtLeastZero
@@ -74,16 +71,10 @@ def _discretised(P: float, I: float, tau: float, step: float) -> tuple[FloatArra
 def respond(loops: Sequence[ServoLoop], command: FloatArray, step: float) -> FloatArray:
     """Return the angles of motors that start at rest at their first command.
 
-    Args:
-        loops: One loop per motor.
-        command: References, (..., time, motor) [rad], linear between samples.
-        step: Time step [s].
+    References are (..., time, motor) [rad], linear between samples that are `step` [s] apart.
 
     Returns:
         Angles at the same instants, (..., time, motor) [rad].
-
-    Raises:
-        InputError: If the last axis does not have one column per loop.
     """
     from scipy.signal import lfilter
 

@@ -48,10 +48,8 @@ class Settling(Bounded):
     def offset(self, robot: Robot, pose: FloatArray, direction: FloatArray) -> FloatArray:
         """Return the mean settled error of a healthy motor, (..., motor) [rad], log's sense.
 
-        Args:
-            robot: The robot.
-            pose: Approximate settled angles in the log's sense, (..., motor) [rad].
-            direction: Sign of each motor's last travel in the log's sense, (..., motor).
+        `pose` are approximate settled angles, `direction` the signs of the last travels, (...,
+        motor) each, log's sense.
         """
         offset = np.asarray(self.bias) - np.asarray(self.friction) * direction
         if not any(self.compliance):
@@ -80,11 +78,8 @@ def sag(
 ) -> FloatArray:
     """Return the displacement of every motor by gravity, (..., motor) [rad], log's sense.
 
-    Args:
-        robot: The robot.
-        pose: Angles of the arm in the log's sense, (..., motor) [rad].
-        compliance: Yielding of each motor, (..., motor) [rad/(N m)].
-        payload: Mass at the tool point, () or the leading axes of `pose` [kg].
+    Angles are (..., motor) [rad], yieldings (..., motor) [rad/(N m)]; the mass at the tool point
+    [kg] has the leading axes of the pose, or none.
     """
     return robot.sense * compliance * robot.loads.torque(pose * robot.sense, payload)
 

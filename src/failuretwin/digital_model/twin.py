@@ -69,8 +69,7 @@ class DigitalTwin:
     def geometry_columns(self, position: ArrayLike) -> FloatArray:
         """Return the derivative of `path` by small corrections of every joint's frame.
 
-        Args:
-            position: Motor angles in the log's sense, (..., motor) [rad].
+        Motor angles are in the log's sense, (..., motor) [rad].
 
         Returns:
             (..., axis, 6 * motor): x, y, z [m/m] and roll, pitch, yaw [m/rad] of the first motor's

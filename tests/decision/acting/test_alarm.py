@@ -7,10 +7,10 @@ from small_world import SmallWorld, believed, task_of
 
 from failuretwin.core.hypothesis import SURE, motor_probabilities
 from failuretwin.decision.acting.actor import Actor
-from failuretwin.decision.acting.alarm import FaultAlarm
 from failuretwin.decision.acting.belief import Belief, Judge
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.safety import SafetyGate
+from failuretwin.decision.acting.session import FaultAlarm
 from failuretwin.decision.streaming.set_up_watch import PROOF
 from failuretwin.inference.observation.healthy_model import HealthyModel
 

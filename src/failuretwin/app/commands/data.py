@@ -13,12 +13,11 @@ import click
 import failuretwin as ft
 from failuretwin.app.commands import options as opt
 from failuretwin.app.commands.store import StoreOptions, recorded_option, store_options
-from failuretwin.app.commands.workforce import WorkforceOptions, workforce_options
 from failuretwin.app.terminal import progress_bar, show, tell
 from failuretwin.core.errors import InputError, counted
 
 if TYPE_CHECKING:
-    from failuretwin.digital_model.urdf.report import UrdfReport
+    from failuretwin.digital_model.urdf.check import UrdfReport
 
 
 @click.command("import")
@@ -32,14 +31,14 @@ if TYPE_CHECKING:
 @store_options
 @recorded_option
 @opt.reading_options
-@workforce_options("the runs", "the logs")
+@opt.workforce_options("the runs", "the logs")
 @opt.robot_options
 def import_(
     out: Path,
     memory: StoreOptions,
     recorded: datetime | None,
     reading: opt.LogOptions,
-    force: WorkforceOptions,
+    force: opt.WorkforceOptions,
     robot: opt.RobotOptions,
 ) -> None:
     """Read logs and write them as one run set.
@@ -88,7 +87,7 @@ def import_(
     "[drift]. Default: the paper's stuck and steady_state_error; the other modes as assumed in "
     "docs/fault_modes.md.",
 )
-@workforce_options("the runs", "the folder of --out")
+@opt.workforce_options("the runs", "the folder of --out")
 @opt.plugin_option
 @opt.calibrated_robot_options("none")
 def simulate(
@@ -98,7 +97,7 @@ def simulate(
     engine: str,
     sensors: str | None,
     faults: Path | None,
-    force: WorkforceOptions,
+    force: opt.WorkforceOptions,
     robot: opt.RobotOptions,
 ) -> None:
     """Make labelled runs with the digital twin and write them as a run set.
@@ -222,11 +221,7 @@ def init(out: Path, home: str | None, urdf: UrdfOptions) -> None:
 
 
 def _check_profile(out: Path, replaced: Path | None = None) -> None:
-    """Check the name of a profile to write; only the profile `replaced` may be overwritten.
-
-    Raises:
-        InputError: If it does not end in .toml, or another file has this name.
-    """
+    """Check the name of a profile to write; only the profile `replaced` may be overwritten."""
     if out.suffix != ".toml":
         raise InputError(f"{out}: a profile ends in .toml. Give such a name.")
     if out.exists() and (replaced is None or out.resolve() != replaced.resolve()):

@@ -20,7 +20,6 @@ from failuretwin.app.commands.store import (
     recorded_option,
     store_options,
 )
-from failuretwin.app.commands.workforce import WorkforceOptions, workforce_options
 from failuretwin.app.terminal import show, tell
 from failuretwin.core.errors import InputError
 
@@ -121,7 +120,7 @@ WHOLE = (
 @learned_priors_option
 @recorded_option
 @opt.reading_options
-@workforce_options("results", "the logs and the folder of --parquet")
+@opt.workforce_options("results", "the logs and the folder of --parquet")
 @opt.plugin_option
 @opt.calibrated_robot_options()
 def diagnose(
@@ -144,7 +143,7 @@ def diagnose(
     recorded: datetime | None,
     memory: StoreOptions,
     reading: opt.LogOptions,
-    force: WorkforceOptions,
+    force: opt.WorkforceOptions,
     robot: opt.RobotOptions,
 ) -> None:
     """Diagnose runs from commands and tool path alone, or what other sensors saw (--sensing).
@@ -220,11 +219,7 @@ def _diagnose_many(
     stored: RobotRecord | None,
     recorded: datetime | None,
 ) -> None:
-    """Diagnose runs of any number into parquet files, and store the diagnoses if there is a store.
-
-    Raises:
-        InputError: If an option needs all runs in memory.
-    """
+    """Diagnose runs of any number into parquet files, and store the diagnoses if asked to."""
     from failuretwin.app.many_runs import diagnose_many, remember_many
 
     opt.refuse_unused("--parquet holds a piece of the runs in memory, not all", *WHOLE)

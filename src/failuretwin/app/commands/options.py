@@ -72,9 +72,7 @@ def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F],
 def refuse_unused(why: str, *names: str) -> None:
     """Raise InputError if the user has given options that have no effect here, and say why.
 
-    Args:
-        why: The reason, the beginning of a sentence.
-        names: Names of the parameters.
+    The reason is the beginning of a sentence.
     """
     context = click.get_current_context()
     given = [
@@ -309,6 +307,47 @@ live_options = gathered(
         "the log, or never.",
     ),
 )
+
+
+# Commands whose work can be spread over processes.
+
+
+@dataclass(frozen=True)
+class WorkforceOptions:
+    """Values of `workforce_options`: who does the work."""
+
+    workers: int
+    scheduler: str | None
+
+    @property
+    def workforce(self) -> Workforce:
+        """The processes that do the work."""
+        from failuretwin.data_knowledge.workers import Workforce
+
+        return Workforce(self.workers, self.scheduler)
+
+
+def workforce_options(result: str, shared: str) -> Callable[[F], F]:
+    """Return the options `--workers N` and `--scheduler ADDRESS`.
+
+    `result` does not depend on them; workers of a scheduler must share the files `shared`.
+    """
+    return gathered(
+        WorkforceOptions,
+        "force",
+        count_option(
+            "--workers",
+            1,
+            f"Processes on this machine to spread the work over; {result} do not depend on it.",
+            least=1,
+        ),
+        click.option(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="Dask scheduler whose workers do the work instead, such as tcp://host:8786. They "
+            f"must share {shared}.",
+        ),
+    )
 
 
 # Commands that move an arm: which one, with which faults, within which limits.

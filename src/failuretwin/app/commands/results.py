@@ -139,21 +139,17 @@ def advise(
 def _write_template(path: Path) -> None:
     """Write a cost table to fill in; an existing file is never overwritten."""
     from failuretwin.data_knowledge.store import write_text
-    from failuretwin.decision.expected_cost import TEMPLATE
+    from failuretwin.decision.expected_cost import costs_template
 
     if path.exists():
         raise OutputError(f"{path}: is there already. Choose another name.")
-    write_text(TEMPLATE, path)
+    write_text(costs_template(), path)
 
 
 def _results_report(
     source: Path, costs_file: Path, run: str | None, stored: RobotRecord | None
 ) -> Report:
-    """Return the advice on a stored diagnosis, by the learned priors of a store if there is one.
-
-    Raises:
-        InputError: If a file cannot be read, or there is no such run.
-    """
+    """Return the advice on a stored diagnosis, by the learned priors of a store if there is one."""
     from failuretwin.decision.expected_cost import advise as advise_on
     from failuretwin.decision.expected_cost import load_costs
     from failuretwin.decision.results import read_results
@@ -187,11 +183,7 @@ def _posterior(diagnosis: ft.Diagnosis | Record, stored: RobotRecord | None) -> 
 
 
 def _life_report(source: Path | None, memory: StoreOptions, robot: opt.RobotOptions) -> Report:
-    """Return the remaining life of every motor of a tracked robot; no source: that of the store.
-
-    Raises:
-        InputError: If the history cannot be read, holds no run, or is of another robot.
-    """
+    """Return the remaining life of every motor of a tracked robot; no source: that of the store."""
     import numpy as np
 
     from failuretwin.connection.life_history import read_rows

@@ -64,12 +64,7 @@ def map_parts(found: Reach, *, per_point: bool) -> list[str | Table]:
 
 
 def save_map(maps: Sequence[Reach], folder: Path) -> None:
-    """Draw each map from above and from the side; reachable points are filled, others hollow.
-
-    Raises:
-        InputError: If matplotlib is missing.
-        OutputError: If it cannot be written.
-    """
+    """Draw each map from above and from the side; reachable points are filled, others hollow."""
     figure = new_figure(7.0, 3.0 * len(maps))
     panels = np.atleast_2d(figure.subplots(len(maps), 2))
     for (above, side), found in zip(panels, maps, strict=True):

@@ -195,10 +195,7 @@ def parameter_table(
 ) -> Table:
     """Return a row for each parameter: value, interval, unit, deviations from such robots, note.
 
-    Args:
-        parameters: The parameters.
-        robot: The robot, whose servo counts are shown; None: angles are shown in degrees.
-        interval: Heading of the interval.
+    Angles are in the servo counts of the robot; None: in degrees.
     """
     compared = any(p.deviations is not None for p in parameters)
     rows = []

@@ -117,11 +117,7 @@ def check_record(result: CheckResult, robot: Robot, seconds: float) -> dict[str,
 
 
 def kept_checks(path: Path) -> list[dict[str, Any]]:
-    """Return the checks of a kept file, the oldest first.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
+    """Return the checks of a kept file, the oldest first."""
     try:
         checks = json.loads(path.read_text(encoding="utf-8"))["checks"]
         _ = checks[-1]["date"], checks[-1]["motors"][0]["zero"]
@@ -133,11 +129,7 @@ def kept_checks(path: Path) -> list[dict[str, Any]]:
 
 
 def keep_check(path: Path, motions: Motions, checks: Sequence[dict[str, Any]]) -> None:
-    """Keep motions, and the checks that were made by them, the oldest first.
-
-    Raises:
-        OutputError: If it cannot be written.
-    """
+    """Keep motions, and the checks that were made by them, the oldest first."""
     write_records([{"motions": motions.record(), "checks": checks}], path)
 
 
@@ -164,11 +156,7 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
 
 
 def motion_lines(motions: Motions, robot: Robot, written: Path | None = None) -> list[Part]:
-    """Return the movements of the motors, a row each; they go to a file if one is named.
-
-    Raises:
-        OutputError: If the file cannot be written.
-    """
+    """Return the movements of the motors, a row each; they go to a file if one is named."""
     saved = []
     if written is not None:
         write_motions(motions, robot, written)

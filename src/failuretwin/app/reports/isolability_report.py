@@ -104,11 +104,7 @@ def isolability_records(found: IsolabilityReport) -> list[dict[str, Any]]:
 
 
 def save_picture(found: IsolabilityReport, robot: Robot, folder: Path) -> None:
-    """Draw the smallest sizes, a panel a mode, as `isolability.png`.
-
-    Raises:
-        OutputError: If it cannot be written.
-    """
+    """Draw the smallest sizes, a panel a mode, as `isolability.png`."""
     modes = list(dict.fromkeys(Hypothesis.parse(name).faults[0].mode for name in found.isolated))
     figure = new_figure(max(3.2 * len(modes), NARROWEST_IN), 2.6)
     for panel, mode in zip(np.ravel(figure.subplots(1, max(len(modes), 1))), modes, strict=False):

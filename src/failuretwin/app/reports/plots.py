@@ -39,11 +39,7 @@ SMALL: dict[str, Any] = {"fontsize": 8, "frameon": False}
 
 
 def figure_class() -> Any:
-    """Return matplotlib's class of figures.
-
-    Raises:
-        InputError: If matplotlib is missing.
-    """
+    """Return matplotlib's class of figures."""
     with needs_extra("pictures need matplotlib", "plots"):
         from matplotlib.figure import Figure
     return Figure
@@ -56,11 +52,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save_figure(figure: Figure, folder: Path, name: str) -> None:
-    """Write a figure into a folder as a PNG file.
-
-    Raises:
-        OutputError: If it cannot be written.
-    """
+    """Write a figure into a folder as a PNG file."""
     with filling(folder) as partial:
         figure.savefig(partial / name, dpi=130)
 
@@ -157,11 +149,7 @@ def clean(panel: Axes) -> None:
 
 
 def render_page(template: str, values: Mapping[str, Any]) -> str:
-    """Return the page of a template beside this module; text in it is escaped.
-
-    Raises:
-        InputError: If jinja2 is missing.
-    """
+    """Return the page of a template beside this module; text in it is escaped."""
     with needs_extra("pictures need jinja2", "plots"):
         from jinja2 import Environment, PackageLoader, StrictUndefined
     loader = PackageLoader("failuretwin.app", "")
@@ -174,11 +162,7 @@ def render_page(template: str, values: Mapping[str, Any]) -> str:
 
 
 def write_reliability(evaluation: Evaluation, folder: Path) -> None:
-    """Write `reliability.png` into `folder`.
-
-    Raises:
-        InputError: If no run got a verdict, or matplotlib is missing.
-    """
+    """Write `reliability.png` into `folder`."""
     if evaluation.calibration is None:
         raise InputError("no run got a verdict, so there is no reliability to draw.")
     bins = evaluation.calibration.equal

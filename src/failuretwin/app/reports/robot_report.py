@@ -9,8 +9,8 @@ from failuretwin.app.terminal import Part, Table
 from failuretwin.connection.registration.fit import Registration
 from failuretwin.core.errors import counted
 from failuretwin.digital_model.kinematics import has_range
+from failuretwin.digital_model.urdf.check import JointReport, UrdfReport
 from failuretwin.digital_model.urdf.file import UrdfJoint
-from failuretwin.digital_model.urdf.report import JointReport, UrdfReport
 
 
 def registration_parts(found: Registration) -> list[Part]:

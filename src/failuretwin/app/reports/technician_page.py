@@ -60,9 +60,7 @@ class Mark:
 def joint_places(chain: SerialChain, q: FloatArray) -> FloatArray:
     """Return base, origin of every joint frame and the tool, (joint + 2, 3) [m], base frame.
 
-    Args:
-        chain: The kinematics, in the frame of the base.
-        q: Joint values in chain order, (joint,) [rad or m].
+    Joint values are in chain order, (joint,) [rad or m].
     """
     return np.vstack([np.zeros(3), chain.frames(q)[1]])
 
@@ -213,11 +211,7 @@ def write_report(
     folder: Path,
     sections: Sequence[Section] = (),
 ) -> None:
-    """Write the page of diagnosed runs into a folder, and its pictures as files; see `write_page`.
-
-    Raises:
-        OutputError: If it cannot be written.
-    """
+    """Write the page of diagnosed runs into a folder, with its pictures; see `write_page`."""
     chosen = chosen_runs(diagnoses, twin.robot, MOST_PICTURES)
     with filling(folder) as partial:
         pictures = plot_runs(runs, diagnoses, twin, partial, chosen)
@@ -234,14 +228,8 @@ def write_page(
 ) -> None:
     """Write the page of some runs.
 
-    Args:
-        diagnoses: Diagnosis of each run.
-        state: State of the robot over all of them.
-        robot: The robot.
-        path: The file.
-        pictures: PNG files of the runs with details, by index; None: the first runs have details,
-            without pictures.
-        sections: Further sections.
+    `pictures` are PNG files of the runs with details, by index; None: the first runs have details,
+    without pictures.
     """
     judged, marks = Judged.of(diagnoses), _marks(state)
     rows = _rows(diagnoses, pictures or dict.fromkeys(range(MOST_PICTURES)), robot)

@@ -62,15 +62,8 @@ class _Attempt:
 class Actor:
     """Carries out a task on one arm.
 
-    Args:
-        planner: Plans movements.
-        model: The healthy arm.
-        task: The task.
-        belief: What the arm is taken to be.
-        command: What the motors were told last, (motor,) [rad].
-        settings: How it is carried out; None: the defaults.
-        judge: Weighs movements in `see`; None: nothing is diagnosed there.
-        tell: Called with what is found out and done, as it happens.
+    `command` is what the motors were told last, (motor,) [rad]. Without a `judge` nothing is
+    diagnosed. `tell` is called with what is found out and done, as it happens.
     """
 
     def __init__(
@@ -128,10 +121,8 @@ class Actor:
     def see(self, point: FloatArray | None, start_s: float, rest_s: float) -> None:
         """Learn from where the tool came to rest, and conclude the target if it is time to.
 
-        Args:
-            point: Where, (3,) [m]; None: it was not seen at rest.
-            start_s: When the last order was given, by the robot's clock [s].
-            rest_s: When the tool was seen at rest [s].
+        `point` is (3,) [m], None: it was not seen at rest. Times are those of the robot's clock
+        [s].
         """
         if self._order is None or self.done:
             return

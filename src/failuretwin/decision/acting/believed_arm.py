@@ -185,10 +185,8 @@ class BelievedArm:
     ) -> FloatArray:
         """Return the poses that commands lead to, (..., motor) [rad].
 
-        Args:
-            command: Commands, (..., motor) [rad].
-            previous: Commands before them, (..., motor) [rad].
-            time_s: Times of arrival, (...) [s]; they count for faults that grow.
+        Commands and those before them are (..., motor) [rad]; times of arrival, (...) [s], count
+        for faults that grow.
         """
         travel = command - previous
         direction = np.where(np.abs(travel) > UNMOVED_RAD, np.sign(travel), 0.0)
@@ -230,12 +228,8 @@ class BelievedArm:
         """Return the command that leads to a pose, (motor,) [rad], within limits, in whole counts.
 
         A motor that is held is told to stay where it stands: if it is not held after all, it goes
-        there, and the plan is still right; if it is, it does not push against its gear.
-
-        Args:
-            pose: Where the motors shall settle, (motor,) [rad].
-            previous: What they were told before, (motor,) [rad].
-            time_s: When they will arrive [s].
+        there, and the plan is still right; if it is, it does not push against its gear. The motors
+        were told `previous` before, (motor,) [rad], and will arrive at `time_s` [s].
         """
         command = self._nearly(pose, previous)
         for _ in range(NEWTON_STEPS):

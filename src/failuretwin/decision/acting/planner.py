@@ -203,10 +203,7 @@ class Planner:
     def cost(self, pose: FloatArray, arm: BelievedArm, at: Standing) -> FloatArray:
         """Return what poses cost, (pose,) [s]: time of the way, and what weak motors have to do.
 
-        Args:
-            pose: (pose, motor) [rad].
-            arm: The arm as it is believed to be.
-            at: Where it stands.
+        Poses are (pose, motor) [rad].
         """
         cost = self.way_s(pose, at)
         weight = np.zeros(pose.shape[-1]) if self.spared is None else self.spared.copy()
@@ -233,9 +230,8 @@ class Planner:
     def sparing_lines(self, ways: Sequence[tuple[FloatArray, Standing]]) -> list[str]:
         """Return in words what sparing has changed.
 
-        Args:
-            ways: For each, the pose as it was taken and as it would have been, (2, motor) [rad],
-                and where the arm stood.
+        A way is the pose as it was taken and as it would have been, (2, motor) [rad], and where the
+        arm stood.
         """
         if self.spared is None or not ways:
             return []

@@ -164,10 +164,7 @@ def reach_by_motor(
 ) -> Sequence[MotorReach]:
     """Return for each motor what can be reached with it held, over where it is held.
 
-    Args:
-        gate: The arm, and what is safe.
-        points: (point, 3) [m], or a task.
-        seed: Seed of the poses that a search begins with.
+    Points are (point, 3) [m].
     """
     robot = gate.robot
     jacobian = InverseKinematics.of(robot).tool(_usual_poses(robot, POINTS, seed))[1]
@@ -185,13 +182,8 @@ def parking_place(gate: SafetyGate, motor: int, targets: Sequence[Target], stand
 
         angle* = argmax over angles of the number of targets that the other motors reach
 
-    Of angles that are as good, the one nearest to the present angle.
-
-    Args:
-        gate: The arm, and what is safe.
-        motor: Index of the motor, which still moves.
-        targets: Remaining targets in their order; at least one.
-        stands: Present angle of the motor [rad].
+    Of angles that are as good, the one nearest to the present angle. The motor, an index, still
+    moves and now `stands` at an angle [rad].
     """
     low, high = (ends[motor] for ends in usable_limits(gate.robot))
     angles = np.append(np.linspace(low, high, ANGLES + 2)[1:-1], np.clip(stands, low, high))

@@ -13,11 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 
 from failuretwin.connection.links.base import Order
-from failuretwin.core.errors import FailureTwinError, InputError
+from failuretwin.core.config import Bounded, Bounds
+from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.clearance import Clearance
 from failuretwin.digital_model.inverse_kinematics import usable_limits
@@ -40,7 +42,7 @@ class UnsafeOrderError(FailureTwinError):
 
 
 @dataclass(frozen=True)
-class SafetyLimits:
+class SafetyLimits(Bounded):
     """What orders must keep to.
 
     Attributes:
@@ -49,15 +51,9 @@ class SafetyLimits:
         floor_m: Height of the floor in the base frame [m]; None: that of the base.
     """
 
-    speed_share: float = 0.5
+    speed_share: Annotated[float, Bounds(1e-6, 1.0)] = 0.5
     radius_m: float | None = None
     floor_m: float | None = None
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.speed_share <= 1.0:
-            raise InputError(
-                f"speed_share is {self.speed_share:g}, expected a share above 0, 1 at most."
-            )
 
 
 @dataclass(frozen=True)
@@ -117,9 +113,7 @@ class SafetyGate:
     def wrong(self, order: Order, ways: Sequence[Way]) -> str:
         """Return why an order must not be sent, empty if it may.
 
-        Args:
-            order: The order.
-            ways: Ways that the arm may take with it; the first: as the motors are told.
+        Of the ways that the arm may take, the first is as the motors are told.
         """
         if not (np.isfinite(order.target).all() and np.isfinite(order.duration).all()):
             return "the order holds a value that is not finite"
@@ -136,9 +130,6 @@ class SafetyGate:
         """Return what an arm would come too near to on some ways, empty if to nothing.
 
         An arm that stands too near already may go where it comes no nearer.
-
-        Args:
-            ways: Begin and end of each, (motor,) [rad].
         """
         poses = [way_between(start, end) for start, end in ways]
         first = np.cumsum([0, *(len(way) for way in poses)])

@@ -92,9 +92,6 @@ def read_task(path: str | Path) -> Task:
 
     Columns are x, y, z [m] in the frame of the tool sensor, and where wanted dx, dy, dz (approach
     direction) and tolerance [m].
-
-    Raises:
-        InputError: If it cannot be read, lacks a column or holds what is no number.
     """
     path = Path(path)
     try:

@@ -188,12 +188,7 @@ class Work:
         self._sent: list[tuple[FloatArray, FloatArray]] = []
 
     def carry_out(self) -> None:
-        """Carry the task out.
-
-        Raises:
-            Halted: If somebody else commands the arm, or it falls silent.
-            UnsafeOrderError: If an order must not be sent.
-        """
+        """Carry the task out."""
         while (order := self.actor.next()) is not None:
             self._send(order)
             start = self._now
@@ -242,11 +237,7 @@ class Work:
         return None
 
     def _next_event(self) -> Event | None:
-        """Return what the arm says next; None: nothing just now.
-
-        Raises:
-            Halted: If it has ended or fallen silent, or somebody else commands it.
-        """
+        """Return what the arm says next; None: nothing just now."""
         event = self.commander.poll(POLL_S)
         self.hear(event)
         if event is None:
@@ -274,9 +265,6 @@ def first_standing(commander: Commander) -> FloatArray:
     """Return what the motors of an arm were told last, (motor,) [rad].
 
     Where no command has been heard, where they are read to stand.
-
-    Raises:
-        InputError: If neither is heard within `FIRST_WAIT_S`.
     """
 
     def heard(event: Event | None) -> FloatArray | None:
@@ -315,9 +303,6 @@ def where_it_stands(commander: Commander) -> FloatArray:
     """Return where the motors of an arm are read to stand, (motor,) [rad], to stop it there.
 
     Where they are not read, what they were told last.
-
-    Raises:
-        InputError: If neither is heard within `FIRST_WAIT_S`.
     """
     found = _awaited(commander, _angles)
     found = commander.standing if found is None else found

@@ -86,11 +86,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return tags
 
     def fit(self, X: Runs, y: ArrayLike | None = None) -> LearnedDiagnoser:
-        """Train on runs and their classes; `y` of None: the truth in the run set.
-
-        Raises:
-            InputError: If there are fewer than two classes.
-        """
+        """Train on runs and their classes; `y` of None: the truth in the run set."""
         y = _truth(X, y)
         self.movements_ = None
         if _is_run_set(X):
@@ -158,9 +154,6 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """Set the temperature with the best mean log score on held-out runs; no test set.
 
         `y` are the classes of the runs; None: the truth in the run set.
-
-        Raises:
-            InputError: If a class is not among those of the network.
         """
         scores = self.scores(X)
         number = {name: i for i, name in enumerate(self.classes_.tolist())}
@@ -191,7 +184,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     def predict_proba(self, X: Runs) -> FloatArray:
         """Return the probability of each class, (run, class), in the order of `classes_`."""
-        return probabilities(self.scores(X), self.temperature_)
+        return softmax(self.scores(X) / self.temperature_, axis=1)
 
     def predict(self, X: Runs) -> NDArray[Any]:
         """Return the most probable class of each run."""
@@ -208,9 +201,6 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """Return the diagnosis of each run of a run set, or of logs by their path.
 
         Uses `command` and `measured` alone; the truth is only copied to the results.
-
-        Raises:
-            InputError: If the run set is of another robot, or the network has no encoder.
         """
         check_is_fitted(self, "network_")
         robot = self._encoder().robot
@@ -299,11 +289,6 @@ def movement_counts(runs: xr.Dataset) -> IntArray:
     """Return the number of movements of each run, (run,)."""
     signals = signals_of(runs)
     return find_movements(signals.command, signals.time).exists.sum(axis=1)
-
-
-def probabilities(scores: FloatArray, temperature: float) -> FloatArray:
-    """Return p_k ~ exp(logit_k / temperature), (run, class)."""
-    return softmax(scores / temperature, axis=1)
 
 
 TEMPERATURES = (0.05, 20.0)

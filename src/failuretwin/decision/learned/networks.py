@@ -150,11 +150,7 @@ NETWORKS: dict[str, type[PaperLstm] | type[Cnn] | type[MotorWise]] = {
 
 
 def build_network(name: str, shape: Shape) -> nn.Module:
-    """Return a new network with random weights from torch's generator.
-
-    Raises:
-        InputError: If there is no such network.
-    """
+    """Return a new network with random weights from torch's generator."""
     if name not in NETWORKS:
         raise unknown_name("network", name, NETWORKS)
     return NETWORKS[name](shape)

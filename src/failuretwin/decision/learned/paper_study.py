@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import multiprocessing
+import os
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -117,12 +118,7 @@ def class_names(robot: Robot) -> list[str]:
 
 
 def given_test_set(path: Path, robot: Robot, published_labels: bool) -> Exam:
-    """Read a test set with linearly interpolated readings, as the authors processed theirs.
-
-    Raises:
-        InputError: If it cannot be read, its truth is unknown or not one of the classes, or
-            `published_labels` is set for a run set.
-    """
+    """Read a test set with linearly interpolated readings, as the authors processed theirs."""
     if published_labels and path.suffix in SUFFIXES:
         raise InputError(
             f"{path}: is a run set, which has its labels already; --published-labels is for raw "
@@ -206,9 +202,7 @@ def _spread(
 ) -> None:
     import torch
 
-    from failuretwin.decision.training import cores
-
-    at_a_time = 1 if torch.cuda.is_available() else min(len(jobs), cores())
+    at_a_time = 1 if torch.cuda.is_available() else min(len(jobs), os.cpu_count() or 1)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(at_a_time, context, initializer=_start) as pool:
         try:
@@ -336,11 +330,7 @@ def mean_confusion(repeats: Sequence[Training]) -> FloatArray:
 
 
 def check_folder(folder: Path, resume: bool) -> None:
-    """Check that the study may write to `folder`.
-
-    Raises:
-        InputError: If it is not empty and `resume` is off, or it holds no study to resume.
-    """
+    """Check that the study may write to `folder`."""
     taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
     if taken and not resume:
         raise InputError(
@@ -356,11 +346,7 @@ def check_folder(folder: Path, resume: bool) -> None:
 def run_study(
     plan: StudyPlan, robot: Robot, test: Exam, folder: Path, on_progress: Callable[[int], None]
 ) -> list[Training]:
-    """Run what is missing of a study in a folder that `check_folder` accepted.
-
-    Raises:
-        InputError: If the folder holds a study with another plan, or an extra is missing.
-    """
+    """Run what is missing of a study in a folder that `check_folder` accepted."""
     manifest = _manifest(plan, robot, test)
     stored = folder / PLAN_FILE
     if stored.is_file():

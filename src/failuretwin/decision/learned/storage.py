@@ -1,18 +1,14 @@
-"""Trained networks in files: our own format, ONNX, and Python that needs numpy alone.
+"""Trained networks in files: our own format and ONNX.
 
 Our own format is an npz archive of plain arrays and a JSON configuration, read without pickle.
 """
 
 from __future__ import annotations
 
-import base64
 import json
 import platform
-import textwrap
 import warnings
 from dataclasses import asdict
-from importlib.resources import files
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -28,17 +24,9 @@ from failuretwin.core.foreign import reading
 from failuretwin.data_knowledge.readers.file_claims import check_npz
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser, network_shape
-from failuretwin.decision.learned.feature_encoder import (
-    DAMPING_M,
-    DISTANCE_M,
-    POINTS,
-    TURN_RAD,
-    Expectation,
-    FeatureEncoder,
-)
+from failuretwin.decision.learned.feature_encoder import POINTS, Expectation, FeatureEncoder
 from failuretwin.decision.learned.log_pool import PoolWeights
-from failuretwin.decision.learned.networks import STRIDES, Standard, build_network
-from failuretwin.digital_model.kinematics import GRAVITY
+from failuretwin.decision.learned.networks import Standard, build_network
 from failuretwin.digital_model.robot import Robot, load_robot
 
 FORMAT = 1
@@ -56,12 +44,7 @@ def check_network_file(path: Path) -> None:
 
 
 def save_network(diagnoser: LearnedDiagnoser, path: str | Path) -> None:
-    """Write a trained network; an existing file is replaced atomically.
-
-    Raises:
-        InputError: If the suffix is not .npz.
-        OutputError: If it cannot be written.
-    """
+    """Write a trained network; an existing file is replaced atomically."""
     path = Path(path)
     check_network_file(path)
     configuration = json.dumps(_configuration(diagnoser)).encode()
@@ -208,10 +191,6 @@ def export_onnx(diagnoser: LearnedDiagnoser, path: Path) -> None:
 
     Its input is `features` (run, 100, channel), its output `probabilities` (run, class); the
     metadata entry `classes` lists the classes.
-
-    Raises:
-        InputError: If onnxscript is missing.
-        OutputError: If the file cannot be written.
     """
     with needs_extra("ONNX files need onnxscript", "learn"):
         import onnxscript  # noqa: F401
@@ -232,65 +211,3 @@ def export_onnx(diagnoser: LearnedDiagnoser, path: Path) -> None:
     program.model.metadata_props["classes"] = ",".join(map(str, diagnoser.classes_))
     with replacing(path) as partial:
         partial.write_bytes(program.model_proto.SerializeToString())
-
-
-def export_numpy(diagnoser: LearnedDiagnoser, path: Path) -> None:
-    """Write a trained network as one Python file that needs numpy alone.
-
-    Raises:
-        InputError: If the name is not that of a Python module, or the network has no encoder.
-        OutputError: If the file cannot be written.
-    """
-    if path.suffix != ".py" or not path.stem.isidentifier():
-        raise InputError(f"{path}: cannot be imported. Expected a name such as diagnoser.py.")
-    if diagnoser.encoder is None:
-        raise InputError("this network has no encoder, so it cannot read runs.")
-    shape = network_shape(diagnoser.encoder, len(diagnoser.standard_.mean), 0)
-    settings = {
-        "classes": [str(name) for name in diagnoser.classes_],
-        "features": diagnoser.encoder.features,
-        "network": diagnoser.network,
-        "points": POINTS,
-        "strides": STRIDES,
-        "motors": shape.motors,
-        "shared": shape.shared,
-        "temperature": float(diagnoser.temperature_),
-    }
-    buffer = BytesIO()
-    arrays = _feature_constants(diagnoser.encoder) | vars(diagnoser.standard_) | _weights(diagnoser)
-    np.savez_compressed(buffer, allow_pickle=False, **arrays)
-    packed = textwrap.fill(base64.b64encode(buffer.getvalue()).decode("ascii"), 96)
-    text = (files("failuretwin.decision.learned") / "standalone.py.txt").read_text("utf-8")
-    for mark, value in {
-        "@MODULE@": path.stem,
-        "@VERSION@": __version__,
-        "@SETTINGS@": json.dumps(settings),
-        "@WEIGHTS@": packed,
-    }.items():
-        text = text.replace(mark, value)
-    with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
-
-
-def _feature_constants(encoder: FeatureEncoder) -> Arrays:
-    """Return the constants of the robot and its healthy behavior that features depend on."""
-    robot = encoder.robot
-    settling = encoder.healthy.settling
-    numbers: dict[str, Any] = {
-        "joints": [joint.T_pj for joint in robot.chain.joints],
-        "tool": robot.chain.T_jt[:3, 3],
-        "mass": robot.loads.mass,
-        "centre": robot.loads.centre,
-        "sense": robot.sense,
-        "sensor_sense": robot.sensor_sense,
-        "gravity": GRAVITY,
-        "payload": settling.payload,
-        "bias": settling.bias,
-        "compliance": settling.compliance,
-        "friction": settling.friction,
-        "lag": encoder.healthy.lag_s,
-        "turn": TURN_RAD,
-        "distance": DISTANCE_M,
-        "damping": DAMPING_M,
-    }
-    return {name: np.asarray(values, dtype=np.float64) for name, values in numbers.items()}

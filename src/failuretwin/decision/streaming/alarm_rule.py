@@ -52,9 +52,6 @@ class AlarmRule:
         alarm: The alarm as it stands.
         hours: Hours of work so far, as far as nothing was wrong.
         passed: Suspicions so far that passed by themselves.
-
-    Raises:
-        InputError: If the budget is not above 0, up to `LARGEST_BUDGET`.
     """
 
     hypotheses: Sequence[str]
@@ -91,10 +88,8 @@ class AlarmRule:
     def see(self, time: float, posterior: FloatArray, concluded_h: float = 0.0) -> Alarm:
         """Return the alarm by what is believed now.
 
-        Args:
-            time: Time of the stream [s].
-            posterior: Probability of each hypothesis, (hypothesis,).
-            concluded_h: Hours of the movements that were concluded since the last call [h].
+        `time` is that of the stream [s], `posterior` is (hypothesis,), `concluded_h` are the hours
+        of the movements that were concluded since the last call.
         """
         faulty, last = posterior[1:], self.alarm.episode
         total = float(faulty.sum())
@@ -135,11 +130,6 @@ def movements_to_tell(
         n = ceil( T / ((1 - l) (-(1 - l) ln p - l ln p_late)) ),    T = ln(movements / false alarms)
 
     with l the share of late starts, before which a movement is not seen.
-
-    Args:
-        imperfections: Rates of losses and late starts, and the time between movements.
-        motors: Names of the motors.
-        per_100_h: False alarms that are allowed in 100 hours.
 
     Returns:
         By motor; those that never lose a command are left out.

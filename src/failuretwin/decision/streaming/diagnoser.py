@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from failuretwin.connection.links.base import OK, STALE, Answer
-from failuretwin.core.config import fingerprint
+from failuretwin.core.config import fingerprint, from_table
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.foreign import reading
 from failuretwin.core.hypothesis import Diagnosis
@@ -24,97 +24,15 @@ from failuretwin.decision.streaming.fleet import MOVEMENTS, StreamingFleet
 from failuretwin.digital_model.calibrated_robot import RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
 
-# The state of a stream in a file: plain arrays, read without running anything.
-
 FORMAT = 5
 SUFFIX = ".npz"
 HEADER = "header"
 
 
-def save_fleet(fleet: StreamingFleet, path: str | Path, said: Sequence[Diagnosis] = ()) -> None:
-    """Write the state of a stream; a file of that name is replaced at the end, all at once.
-
-    Args:
-        fleet: The stream.
-        path: Where to.
-        said: Diagnoses to be kept with it.
-
-    Raises:
-        InputError: If the suffix is not .npz.
-        OutputError: If it cannot be written.
-    """
-    path = Path(path)
-    if path.suffix != SUFFIX:
-        raise InputError(f"{path}: the file of a stream ends in {SUFFIX}.")
-    header = {
-        "format": FORMAT,
-        "method": _method(fleet.diagnoser),
-        "robots": fleet.robots,
-        "movements": fleet.movements,
-        "rate_hz": fleet.rate_hz,
-        "said": [dataclasses.asdict(diagnosis) for diagnosis in said],
-    }
-    arrays: dict[str, Any] = {
-        HEADER: np.frombuffer(json.dumps(header).encode(), dtype=np.uint8),
-        **fleet.state(),
-    }
-    with replacing(path) as partial, partial.open("wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
-
-
-def load_fleet(
-    path: str | Path, diagnoser: BayesDiagnoser, robots: int | None = None
-) -> tuple[StreamingFleet, list[Diagnosis]]:
-    """Return a stream as it was saved, and the diagnoses that were kept with it.
-
-    Args:
-        path: The file.
-        diagnoser: The method with which it was saved.
-        robots: How many robots there must be; None: any number.
-
-    Raises:
-        InputError: If it is no such file or of another robot, method or number of robots.
-    """
-    path = Path(path)
-    with reading(path, "a stream", "Expected a file that `save` of a stream wrote."):
-        check_npz(path)
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-        header = json.loads(arrays.pop(HEADER).tobytes())
-        wrong = _mismatch(header, diagnoser, robots)
-        if wrong:
-            raise InputError(f"{path}: {wrong}")
-        fleet = StreamingFleet(diagnoser, header["robots"], header["rate_hz"], header["movements"])
-        fleet.restore(arrays)
-        said = [Diagnosis.from_fields(fields) for fields in header["said"]]
-    return fleet, said
-
-
-def _method(diagnoser: BayesDiagnoser) -> str:
-    """Return a hash of all that answers depend on."""
-    known = dataclasses.replace(diagnoser, imperfections=diagnoser.healthy_model.imperfections)
-    return fingerprint(known)
-
-
-def _mismatch(header: dict[str, Any], diagnoser: BayesDiagnoser, robots: int | None) -> str:
-    """Return why a stream does not go on from a file, empty if it does."""
-    if header["format"] != FORMAT:
-        return f"is of format {header['format']}, this version reads {FORMAT}. Begin anew."
-    if header["method"] != _method(diagnoser):
-        return (
-            "was saved with another robot, calibration, hypotheses or priors. Name the same, or "
-            "begin anew."
-        )
-    if robots is not None and header["robots"] != robots:
-        return f"is of {header['robots']} robots, expected {robots}."
-    return ""
-
-
 class RobotStream:
     """A stream of one robot: an answer at every sample.
 
-    Args:
-        fleet: What its movements say; a fleet of one.
+    Its movements are followed by a fleet of one.
     """
 
     def __init__(self, fleet: StreamingFleet) -> None:
@@ -193,7 +111,24 @@ class StreamingDiagnoser(RobotStream):
             InputError: If the name does not end in .npz.
             OutputError: If it cannot be written.
         """
-        save_fleet(self._fleet, path, [] if self._diagnosis is None else [self._diagnosis])
+        path = Path(path)
+        if path.suffix != SUFFIX:
+            raise InputError(f"{path}: the file of a stream ends in {SUFFIX}.")
+        said = [] if self._diagnosis is None else [dataclasses.asdict(self._diagnosis)]
+        header = {
+            "format": FORMAT,
+            "method": _method(self._fleet.diagnoser),
+            "robots": self._fleet.robots,
+            "movements": self._fleet.movements,
+            "rate_hz": self._fleet.rate_hz,
+            "said": said,
+        }
+        arrays: dict[str, Any] = {
+            HEADER: np.frombuffer(json.dumps(header).encode(), dtype=np.uint8),
+            **self._fleet.state(),
+        }
+        with replacing(path) as partial, partial.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
 
     @classmethod
     def load(cls, path: str | Path, diagnoser: BayesDiagnoser) -> StreamingDiagnoser:
@@ -204,12 +139,40 @@ class StreamingDiagnoser(RobotStream):
             diagnoser: The method with which it was saved.
 
         Raises:
-            InputError: If it is no such file or of another robot, method or number of robots.
+            InputError: If it is no such file or of another robot or method.
         """
-        stream = cls(diagnoser)
-        stream._fleet, said = load_fleet(path, diagnoser, robots=1)
-        stream._diagnosis = said[0] if said else None
+        path = Path(path)
+        with reading(path, "a stream", "Expected a file that `save` of a stream wrote."):
+            check_npz(path)
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+            header = json.loads(arrays.pop(HEADER).tobytes())
+            wrong = _mismatch(header, diagnoser)
+            if wrong:
+                raise InputError(f"{path}: {wrong}")
+            stream = cls(diagnoser, header["rate_hz"], header["movements"])
+            stream._fleet.restore(arrays)
+            for fields in header["said"]:
+                stream._diagnosis = from_table(Diagnosis, fields, "diagnosis")
         return stream
+
+
+def _method(diagnoser: BayesDiagnoser) -> str:
+    """Return a hash of all that answers depend on."""
+    known = dataclasses.replace(diagnoser, imperfections=diagnoser.healthy_model.imperfections)
+    return fingerprint(known)
+
+
+def _mismatch(header: dict[str, Any], diagnoser: BayesDiagnoser) -> str:
+    """Return why a stream does not go on from a file, empty if it does."""
+    if header["format"] != FORMAT:
+        return f"is of format {header['format']}, this version reads {FORMAT}. Begin anew."
+    if header["method"] != _method(diagnoser):
+        return (
+            "was saved with another robot, calibration, hypotheses or priors. Name the same, or "
+            "begin anew."
+        )
+    return ""
 
 
 def row_of(values: ArrayLike | None) -> FloatArray | None:
@@ -220,15 +183,7 @@ def row_of(values: ArrayLike | None) -> FloatArray | None:
 def reference_of(
     motors: Sequence[str], command: Mapping[str, float] | ArrayLike | None
 ) -> FloatArray | None:
-    """Return a reference as an array, (motor,) [rad]; None stays None.
-
-    Args:
-        motors: Names of the motors in chain order.
-        command: Reference of every motor, by name or (motor,) [rad].
-
-    Raises:
-        InputError: If a motor is missing.
-    """
+    """Return a reference as an array, (motor,) [rad]; None stays None."""
     if not isinstance(command, Mapping):
         return None if command is None else as_floats(command)
     for name in motors:

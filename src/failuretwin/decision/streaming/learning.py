@@ -51,11 +51,7 @@ class LifeLearner:
 
     The frame of the sensor is taken to be as the profile says. A run is worked on in a thread of
     its own, so that answers need not wait; what it taught is known when the next run is complete,
-    however fast time passes.
-
-    Args:
-        diagnoser: The method, with its hypotheses and priors.
-        memory: What keeps what is learned; None: nothing does.
+    however fast time passes. What is learned is kept by `memory`; None: it is not kept.
     """
 
     def __init__(
@@ -84,9 +80,8 @@ class LifeLearner:
     def take(self, movement: SettledEvidence, learns: bool) -> bool:
         """Take in a finished movement and return whether the model has changed.
 
-        Args:
-            movement: A run of this movement alone, by the time of the stream.
-            learns: Whether it is worth while; else it is only remembered for a while.
+        The movement is a run by itself, by the time of the stream. One that is not worth learning
+        is remembered for a while.
         """
         self._waiting.append(movement)
         run = RUN if self.movements < LITTLE else LONG_RUN
@@ -98,9 +93,11 @@ class LifeLearner:
         taught = self._finish()
         if taught and self._memory is not None:
             self._memory.learned(self._life)
-        seen, self._waiting = _joined(self._waiting), []
+        first, *others = self._waiting
+        seen, self._waiting = first.extended_by(*others), []
         told = seen.movements
-        self._told = told if self._told is None else _followed_by(self._told, told)
+        self._told = told if self._told is None else self._told.extended_by(told)
+        self._told = self._told[:, -TIMED:]
         if seen.usable.any():
             self._work = self._worker.submit(self._follow, seen, _from_zero(self._told))
         return taught
@@ -141,26 +138,6 @@ def _learning(now: Imperfections) -> Imperfections:
     return replace(now, name=name, protocol="P1")
 
 
-def _joined(movements: list[SettledEvidence]) -> SettledEvidence:
-    """Return movements one after the other as one run."""
-    run = movements[0].blank(1, len(movements))
-    for at, movement in enumerate(movements):
-        run.put((slice(0, 1), slice(at, at + 1)), movement)
-    run.movements.initial[:] = movements[0].movements.initial
-    return run
-
-
 def _from_zero(movements: Movements) -> Movements:
     """Return movements with times from the first command on."""
     return replace(movements, start=movements.start - movements.start[:, :1])
-
-
-def _followed_by(before: Movements, after: Movements) -> Movements:
-    """Return the movements of a robot with later ones behind them, the latest `TIMED`."""
-    return Movements(
-        before.initial,
-        *(
-            np.concatenate([getattr(before, name), getattr(after, name)], axis=1)[:, -TIMED:]
-            for name in ("target", "ramp_duration", "start")
-        ),
-    )

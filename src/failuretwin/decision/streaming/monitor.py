@@ -86,13 +86,7 @@ class Believed:
 class FaultMonitor(RobotStream):
     """Watches one robot: its faults, its set-up and how it differs from its calibration.
 
-    Args:
-        diagnoser: The method, with its hypotheses and healthy behaviour.
-        false_alarms_per_100h: False alarms that are allowed in 100 hours of work.
-        memory: What keeps what is learned of the robot from watch to watch; None: nothing does.
-
-    Raises:
-        InputError: If the budget makes no sense, or a hypothesis cannot be followed.
+    What is learned is kept from watch to watch by `memory`; None: it is not kept.
     """
 
     def __init__(
@@ -221,10 +215,6 @@ class FaultMonitor(RobotStream):
 
         Movements that are over are counted once and for all, then learned from; the present one
         as it looks now.
-
-        Args:
-            likelihood: What the last movements say.
-            position: Where they lie in the stream.
         """
         count, before = likelihood.usable.shape[1], position.movements
         self._arrived = likelihood.evidence.arrived[0]
@@ -262,12 +252,8 @@ class FaultMonitor(RobotStream):
     def _learn(self, evidence: SettledEvidence, movement: int, begin_s: float) -> None:
         """Learn from a movement that is over; what is known better counts from the next on.
 
-        Nothing is learned of a robot that its calibration fits.
-
-        Args:
-            evidence: The last movements.
-            movement: Which of them.
-            begin_s: When they begin by the time of the stream [s].
+        Nothing is learned of a robot that its calibration fits. The movements begin at `begin_s` by
+        the time of the stream [s].
         """
         if self._learner is None:
             return

@@ -70,10 +70,8 @@ class StreamRuns:
     def add(self, time: float, command: FloatArray | None, point: FloatArray | None) -> None:
         """Take a sample.
 
-        Args:
-            time: When it was taken [s].
-            command: Reference, (motor,) [rad]; None: not known.
-            point: Tool position, (axis,) [m]; None: no reading.
+        The reference is (motor,) [rad], None: not known; the point is (axis,) [m], None: no
+        reading.
         """
         known = command is not None and bool(np.isfinite(command).all())
         if known and command is not None:
@@ -144,9 +142,6 @@ class SetUpWatch:
 
     Attributes:
         rounding: How coarsely tool positions are rounded; None: it does not matter.
-
-    Args:
-        diagnoser: The method, with its hypotheses, healthy behaviour and priors.
     """
 
     def __init__(self, diagnoser: BayesDiagnoser) -> None:
@@ -196,11 +191,7 @@ class SetUpWatch:
             self._ask()
 
     def against(self, alarm: Alarm) -> str:
-        """Return why no motor may be blamed, whatever the alarm says; empty: it may.
-
-        Args:
-            alarm: The alarm by the movements alone.
-        """
+        """Return why no motor may be blamed, whatever the alarm says; empty: it may."""
         if alarm.state == RAISED and alarm.episode is not None:
             return self._against_raised(alarm)
         self._episode, self._blamed = 0, []

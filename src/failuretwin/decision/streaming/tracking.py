@@ -62,11 +62,8 @@ class References(ArrayStruct):
     def see(self, time: float, command: FloatArray) -> IntArray:
         """Take references at a time and return the robots whose movements can be found now.
 
-        What comes late, older than what is known, says nothing new of them.
-
-        Args:
-            time: When they hold [s].
-            command: (robot, motor) [rad]; NaN where not known.
+        What comes late, older than what is known, says nothing new of them. References are (robot,
+        motor) [rad]; NaN where not known.
         """
         known = np.isfinite(command).all(axis=1) & (time > self.last_s)
         first = known & np.isnan(self.last[:, 0])
@@ -82,12 +79,7 @@ class References(ArrayStruct):
         return np.flatnonzero(known & self.moved & (self.still >= STILL_STEPS))
 
     def movements(self, robot: int, samples: SampleBuffer) -> Movements:
-        """Return what a robot was told to do since it was last at rest, as one run.
-
-        Args:
-            robot: Its index.
-            samples: What was said of late.
-        """
+        """Return what a robot was told to do since it was last at rest, as one run."""
         self.moved[robot] = False
         some = samples.since(max(self.before_s[robot], self.left_s[robot] - PLATEAU_S))
         time, command = samples.time[some], samples.command[some, robot]
@@ -109,11 +101,8 @@ OVERDUE_S = 1.0
 class MovementTracker:
     """What is known of the last movements of many robots.
 
-    Args:
-        model: The healthy robot.
-        robots: How many robots there are.
-        movements: Movements that are remembered, the present one included.
-        rate_hz: True rate of the tool sensors [Hz]; None: all readings are real.
+    `movements` are remembered of each robot, the present one included. `rate_hz` is the true rate
+    of the tool sensors [Hz]; None: all readings are real.
     """
 
     def __init__(
@@ -160,10 +149,8 @@ class MovementTracker:
     def see_goals(self, goal: FloatArray) -> IntArray:
         """Take the goals that motors have received and return the robots of which that is news.
 
-        They tell of the present movement, once the reference has come to rest.
-
-        Args:
-            goal: (robot, motor) [rad]; NaN where a motor does not tell.
+        They tell of the present movement, once the reference has come to rest. Goals are (robot,
+        motor) [rad]; NaN where a motor does not tell.
         """
         window = self.window
         some = np.flatnonzero((window.count > 0) & ~self.references.moved)
@@ -214,9 +201,6 @@ class MovementTracker:
 
         A tool that has just come to rest, or may not have set out yet, is left for later readings;
         so is one whose reference moves: how, will be known when that comes to rest.
-
-        Args:
-            robots: Robots that were read.
         """
         at, begin, end = self._due(*self._present(robots[~self.references.moved[robots]]))
         if len(at[0]) == 0:
@@ -262,9 +246,7 @@ class MovementTracker:
     def _settle(self, at: Items, end: FloatArray) -> None:
         """See where tools rest after movements that end.
 
-        Args:
-            at: Robots and their movements, (item,) each.
-            end: Ends of the plateaus, (item,) [s].
+        Robots and movements `at`, and the ends of their plateaus [s], are (item,) each.
         """
         at, begin, end = self._due(at, end)
         if len(begin):
@@ -335,13 +317,8 @@ def _since_rest(
 ) -> BoolArray:
     """Return the readings from which on all are near the newest, (robot, sample).
 
-    None where they span too short a time to tell rest from a slow start.
-
-    Args:
-        samples: Tool positions, (robot, sample, axis) [m]; NaN where there is none.
-        time: When they were taken, (sample,) [s].
-        inside: Samples that count, (robot, sample).
-        same_place_m: How near is near [m].
+    None where they span too short a time to tell rest from a slow start. Samples are (robot,
+    sample, axis) [m], NaN where there is none; those `inside`, (robot, sample), count.
     """
     there = inside & np.isfinite(samples).all(axis=-1)
     if not there.any():

@@ -120,10 +120,6 @@ def rests_throughout(evidence: SettledEvidence, settings: InferenceSettings) -> 
     """Return whether a tool rests in one place though motors were told to move.
 
     It sees what no reading shows that comes with more noise than the tool may move.
-
-    Args:
-        evidence: Where it came to rest after each movement of some runs.
-        settings: How near is still.
     """
     usable = evidence.usable
     points, target = evidence.point[usable][:, :3], evidence.movements.target[usable]
@@ -255,9 +251,8 @@ class TwoPlaces(ArrayStruct):
     def see(self, points: FloatArray, moved_m: float) -> BoolArray:
         """Take readings and return the robots whose readings come from two places, (robot,).
 
-        Args:
-            points: Tool positions, (robot, axis) [m]; NaN where there is none.
-            moved_m: A shorter jump is none [m].
+        Points are (robot, axis) [m], NaN where there is none; a jump of less than `moved_m` [m] is
+        none.
         """
         read = np.isfinite(points).all(axis=1)
         with np.errstate(invalid="ignore"):

@@ -81,10 +81,7 @@ class MovementWindow(ArrayStruct):
     def append(self, robot: int, movements: Movements, number: int) -> None:
         """Add a movement of a robot; where there is no room, the oldest is forgotten.
 
-        Args:
-            robot: Index of the robot.
-            movements: Movements of a single run, by the time of the stream.
-            number: Which of them.
+        It is one of the movements of a single run, by the time of the stream.
         """
         known = self.settled.movements
         if self.count[robot] == known.start.shape[1]:
@@ -116,13 +113,7 @@ class MovementWindow(ArrayStruct):
     def judge(
         self, robots: IntArray, evidence: SettledEvidence, model: HealthyModel
     ) -> MovementLikelihoods:
-        """Return what the last movements of some robots say, looking anew at what is not judged.
-
-        Args:
-            robots: Their indices, (run,).
-            evidence: Where their tools settled.
-            model: The healthy robot.
-        """
+        """Return what the last movements of some robots say, looking anew at what is not judged."""
         some, usual = self._of(robots), model.outcomes(evidence.movements)
         run, movement = np.nonzero(evidence.movements.exists & ~self.judged[some])
         if len(run):
@@ -153,13 +144,7 @@ FIRST_ROOM = 64
 
 
 class SampleBuffer:
-    """Commands and readings of the last seconds, in the order of their times.
-
-    Args:
-        robots: How many robots there are.
-        motors: How many motors each of them has.
-        channels: How many values a reading has.
-    """
+    """Commands and readings of the last seconds, in the order of their times."""
 
     def __init__(self, robots: int, motors: int, channels: int = 3) -> None:
         self._first = self._stop = 0
@@ -185,10 +170,7 @@ class SampleBuffer:
     def add(self, time: float, command: FloatArray, measured: FloatArray) -> None:
         """Take a sample; one that comes late takes its place among the others.
 
-        Args:
-            time: When it was taken [s].
-            command: References, (robot, motor) [rad]; NaN where not known.
-            measured: Readings, (robot, channel) [m]; NaN where there is none.
+        References are (robot, motor) [rad], readings (robot, channel) [m]; NaN where there is none.
         """
         self._make_room()
         at = self._stop

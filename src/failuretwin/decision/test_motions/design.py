@@ -107,13 +107,7 @@ class Designer:
     def sequence(self, start: FloatArray, seconds: float, most: int = 1000) -> list[Movement]:
         """Return movements that fit into a time.
 
-        Args:
-            start: What the motors were told last, (motor,) [rad].
-            seconds: Time for all of them [s].
-            most: So many at most.
-
-        Raises:
-            InputError: If no movement is safe, or none fits.
+        The motors were told `start` last, (motor,) [rad].
         """
         made: list[Movement] = []
         while len(made) < most and (found := self.next(start, made, seconds)) is not None:
@@ -130,10 +124,8 @@ class Designer:
     ) -> Movement | None:
         """Return the movement that is expected to tell most for its time; None: none is safe.
 
-        Args:
-            start: What the motors were told before all movements, (motor,) [rad].
-            made: Movements whose outcome is not known yet.
-            seconds: Longest time of them all [s].
+        The motors were told `start` before all movements, (motor,) [rad]. The outcome of those that
+        are `made` is not known yet; all of them take `seconds` at most [s].
         """
         told = np.array([start, *(movement.order.target for movement in made)])
         since = np.cumsum([0.0, *(movement.seconds for movement in made)])
@@ -180,10 +172,8 @@ class Designer:
     def movement(self, pose: FloatArray, at: FloatArray, start: FloatArray) -> Movement | None:
         """Return the movement to a pose; None if it is not safe.
 
-        Args:
-            pose: Where to, (motor,) [rad].
-            at: What the motors were told last, (motor,) [rad].
-            start: Where a motor is left that does not follow, (motor,) [rad].
+        It begins `at` what the motors were told last; one that does not follow is left at `start`.
+        All are (motor,) [rad].
         """
         ramp = self.gate.least_duration(pose - at)
         order = Order(pose, np.full(len(pose), ramp))
@@ -218,15 +208,8 @@ def next_movement(
 ) -> Order | None:
     """Return the movement that is expected to settle best what a posterior leaves open.
 
-    Args:
-        model: The healthy robot.
-        gate: What is safe.
-        posterior: Of one run.
-        at: What its motors were told last, (motor,) [rad].
-        seed: Seed of the poses that are tried.
-
-    Returns:
-        The order; None: none is safe, or nothing is left to ask.
+    The motors were told `at` last, (motor,) [rad]. None: no movement is safe, or nothing is left to
+    ask.
     """
     members = of_posterior(posterior)
     if len({member.hypothesis for member in members}) < 2:

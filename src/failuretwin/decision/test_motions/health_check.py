@@ -258,13 +258,7 @@ class Checking:
     def motions(self, seconds: float, repeat: Path | None = None, most: int = 1000) -> Motions:
         """Return the motions of a check: those of a file, or designed anew.
 
-        Args:
-            seconds: Time for all of them [s].
-            repeat: The file; None: they are designed.
-            most: So many at most.
-
-        Raises:
-            InputError: If the file cannot be read or is of another robot, or no movement is safe.
+        A file to `repeat` is of designed motions.
         """
         if repeat is not None:
             return read_motions(repeat, self.known.robot)
@@ -274,9 +268,7 @@ class Checking:
     def isolability(self, command: FloatArray, time: FloatArray) -> IsolabilityReport:
         """Return what motions can tell apart, by the priors of a check.
 
-        Args:
-            command: References, (sample, motor) or (run, sample, motor) [rad].
-            time: Their times, (sample,) [s].
+        References are (sample, motor) or (run, sample, motor) [rad], at times (sample,) [s].
         """
         known, priors = self.known, checking(self.model, self.asked)
         return isolability(known.twin, command, time, known.imperfections, self.asked, priors)
@@ -292,11 +284,7 @@ class Checking:
         return Motions.of(self.known.robot, designer.random(self.home, seconds, most))
 
     def isolability_in(self, path: Path) -> IsolabilityReport:
-        """Return the isolability of motions in a file: designed ones, or those of a log.
-
-        Raises:
-            InputError: If it cannot be read, or holds no movement.
-        """
+        """Return the isolability of motions in a file: designed ones, or those of a log."""
         from failuretwin.data_knowledge.readers.read import read_runs
 
         if holds_motions(path, self.known.robot):
@@ -309,21 +297,14 @@ class Checking:
     def shown(self, result: CheckResult, command: FloatArray, time: FloatArray) -> CheckResult:
         """Return a result with what its movements can show, where it says that all is well.
 
-        Args:
-            result: The result.
-            command: References of its movements, (run, sample, motor) [rad].
-            time: Their times, (sample,) [s].
+        References of its movements are (run, sample, motor) [rad], at times (sample,) [s].
         """
         if result.light != GREEN:
             return result
         return replace(result, shown=self.isolability(command, time))
 
     def of_logs(self, paths: Sequence[Path]) -> list[CheckResult]:
-        """Return what logs of a check say that was made elsewhere, a result a run.
-
-        Raises:
-            InputError: If they cannot be read.
-        """
+        """Return what logs of a check say that was made elsewhere, a result a run."""
         from failuretwin.data_knowledge.readers.read import read_runs
 
         runs = read_runs(list(paths), self.known.robot)
@@ -343,19 +324,7 @@ class Checking:
     def carry_out(
         self, motions: Motions, further: int, commander: Commander, tell: Callable[[str], None]
     ) -> CheckResult:
-        """Make planned movements on an arm, then further ones while the result is open.
-
-        Args:
-            motions: Planned movements.
-            further: Maximum number of further movements.
-            commander: The arm.
-            tell: Called with what happens.
-
-        Raises:
-            InputError: If it is not known where the arm stands.
-            Halted: If somebody else commands the arm, or it falls silent.
-            UnsafeOrderError: If an order must not be sent.
-        """
+        """Make planned movements on an arm, then further ones while the result is open."""
         standing, planned = first_standing(commander), motions.orders
         travel = motions.start - standing
         if np.abs(travel).max() > 1e-6:

@@ -117,11 +117,7 @@ class Motions:
 
     @classmethod
     def from_record(cls, record: Any, robot: Robot, where: str) -> Self:
-        """Return the motions of a JSON object.
-
-        Raises:
-            InputError: If it holds none, or those of another robot.
-        """
+        """Return the motions of a JSON object."""
         if not isinstance(record, dict) or any(name not in record for name in NEEDED):
             raise InputError(
                 f"{where}: holds no motions. Expected an object with {', '.join(NEEDED)}, as "
@@ -156,11 +152,7 @@ class Motions:
 
 
 def read_motions(path: Path, robot: Robot) -> Motions:
-    """Read motions from a file, as `write_motions` or a kept check has them.
-
-    Raises:
-        InputError: If it cannot be read, or is of another robot.
-    """
+    """Read motions from a file, as `write_motions` or a kept check has them."""
     if path.suffix in BAGS:
         return _bag_motions(path, robot)
     try:
@@ -214,12 +206,7 @@ def _columns(motors: Sequence[str]) -> list[str]:
 
 
 def _table_record(text: str, where: str) -> dict[str, Any]:
-    """Return the JSON object of a table: two rows a movement, and where all ends.
-
-    Raises:
-        InputError: If rows are missing, or motors do not wait where they arrived.
-        ValueError: If something is no number.
-    """
+    """Return the JSON object of a table: two rows a movement, and where all ends."""
     head, *rows = csv.reader(io.StringIO(text))
     table = np.array(rows, dtype=np.float64)
     whole = table.ndim == 2 and len(table) >= 3 and len(table) % 2 == 1
@@ -243,10 +230,6 @@ def write_motions(motions: Motions, robot: Robot, path: Path) -> None:
     """Write motions as JSON, CSV (straight lines between its rows) or a bag of commands.
 
     Bags are MCAP, as ROS 2 has them, or those of ROS 1 (.bag).
-
-    Raises:
-        InputError: If the name of the file ends otherwise, or exists already as a recording.
-        OutputError: If it cannot be written.
     """
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: ends in {path.suffix!r}, expected {', '.join(SUFFIXES)}.")

@@ -178,8 +178,7 @@ class Outlook:
     def after(self, told: FloatArray) -> Outlook:
         """Return the same with motors that are held where movements would show it least.
 
-        Args:
-            told: What motors were told, the start first, (movement, motor) [rad].
+        `told` is what motors were told, the start first, (movement, motor) [rad].
         """
         last = max(len(told) - 2, 0)
         begin = (0, 0, len(told) // 2, last)
@@ -243,13 +242,9 @@ class Outlook:
 def pairwise_distance(mean: FloatArray, spread: FloatArray, dof: float, cap: float) -> FloatArray:
     """Return how far members are apart in what is seen after a movement, (..., member, member).
 
-    In nats: minus the log of the overlap of two densities; 0 on the diagonal.
-
-    Args:
-        mean: Where the tool is expected, (..., member, channel) [m].
-        spread: Covariance of that, (..., member, channel, channel) [m2].
-        dof: Degrees of freedom of the scatter.
-        cap: What one movement counts at most [nats].
+    In nats: minus the log of the overlap of two densities; 0 on the diagonal. Positions of the tool
+    are expected at `mean`, (..., member, channel) [m], with a covariance `spread` and a scatter of
+    `dof` degrees of freedom; a movement counts `cap` nats at most.
     """
     one, other = np.triu_indices(mean.shape[-2], 1)
     between = 0.5 * (spread[..., one, :, :] + spread[..., other, :, :])
@@ -268,10 +263,8 @@ def pairwise_distance(mean: FloatArray, spread: FloatArray, dof: float, cap: flo
 def expected_information(nats: FloatArray, log_share: FloatArray, kind: IntArray) -> FloatArray:
     """Return how much is expected to be learned about the hypothesis, (...) [nats].
 
-    Args:
-        nats: D of all movements together, (..., member, member) [nats].
-        log_share: Log probability of each member, (member,).
-        kind: Index of its hypothesis, (member,).
+    Distances of all movements together are (..., member, member) [nats]; the log probability of
+    each member and the index of its hypothesis are (member,).
     """
     terms = log_share - nats
     same = kind[:, None] == kind

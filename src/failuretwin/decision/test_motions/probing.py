@@ -12,12 +12,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Annotated, Self
 
 import numpy as np
 
 from failuretwin.connection.links.base import OK, Answer, Commander, CommandSent, Event, Item, Order
 from failuretwin.connection.links.stream_time import StreamClock
+from failuretwin.core.config import AtLeastZero, Bounded, Bounds
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import CLEAR, RAISED
 from failuretwin.core.types import FloatArray
@@ -35,39 +36,24 @@ MOVE = "--move does it"
 
 
 @dataclass(frozen=True)
-class ProbeRules:
+class ProbeRules(Bounded):
     """When an arm is asked while it is watched.
 
     Attributes:
         most: Movements at most for a suspicion, the ways back not counted; 0: never.
         idle_s: Time since the last command of others was carried out [s].
         moves: Whether orders are really sent; else what would be ordered is told.
-
-    Raises:
-        InputError: If a number is negative or not finite.
     """
 
-    most: int
-    idle_s: float = IDLE_S
+    most: Annotated[int, Bounds()]
+    idle_s: AtLeastZero = IDLE_S
     moves: bool = True
-
-    def __post_init__(self) -> None:
-        if self.most < 0 or not 0.0 <= self.idle_s < np.inf:
-            raise InputError(
-                f"{self.most} movements after {self.idle_s:g} s of rest make no sense. Expected "
-                "0 or more of each."
-            )
 
 
 class Prober:
     """Decides when a watched arm is asked, and asks it. It is a sink of the watch.
 
-    Args:
-        monitor: The watch.
-        gate: What is safe.
-        commander: The arm; also the source of the watch.
-        rules: When and how often.
-        seed: Seed of the poses that are tried.
+    The arm is also the source of the watch.
     """
 
     trouble = ""

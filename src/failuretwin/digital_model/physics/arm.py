@@ -24,11 +24,7 @@ NEXT_TO_NOTHING = 1e-9
 
 
 def load_mujoco() -> Any:
-    """Return the module `mujoco`.
-
-    Raises:
-        InputError: If it is not installed.
-    """
+    """Return the module `mujoco`."""
     with needs_extra("the physics engine needs mujoco", "physics"):
         import mujoco
         import mujoco.rollout
@@ -39,14 +35,8 @@ def arm_spec(robot: Robot, payload: float = 0.0) -> Any:
     """Return the robot as a `mujoco.MjSpec` that can still be changed.
 
     Joints turn in the physical sense and keep their URDF names; joints without a motor stay at
-    zero. Gravity points down the z axis of the base frame.
-
-    Args:
-        robot: The robot.
-        payload: Point mass at the tool point [kg].
-
-    Raises:
-        InputError: If mujoco is missing or cannot use the URDF.
+    zero. Gravity points down the z axis of the base frame. The payload is a point mass at the tool
+    point [kg].
     """
     mujoco = load_mujoco()
     path = robot.urdf_file

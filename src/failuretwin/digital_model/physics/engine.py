@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from failuretwin.core.config import Bounded, Bounds
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.physics.arm import load_mujoco
@@ -35,7 +36,7 @@ AT_REST_RAD = 1e-13
 
 
 @dataclass(frozen=True)
-class PhysicsEngine:
+class PhysicsEngine(Bounded):
     """Rigid-body dynamics with servos, sticking gears and flexing joints.
 
     Stiffness is the engine's own: `Drive.compliance` is ignored. A run depends neither on the runs
@@ -50,14 +51,11 @@ class PhysicsEngine:
 
     robot: Robot
     parameters: PhysicsParameters | None = None
-    threads: int = 1
-    step_s: float = STEP_S
+    threads: Annotated[int, Bounds(1)] = 1
+    step_s: Annotated[float, Bounds(1e-9)] = STEP_S
 
     def __post_init__(self) -> None:
-        if self.threads < 1:
-            raise InputError(f"threads is {self.threads}, expected 1 or more.")
-        if not self.step_s > 0.0:
-            raise InputError(f"step_s is {self.step_s}, expected a time above zero [s].")
+        super().__post_init__()
         if self.parameters is not None:
             self.parameters.check_fit(self.robot)
 
@@ -86,10 +84,6 @@ class PhysicsEngine:
                 where the hold begins to the one after it ends. Weakness reduces the servo's torque
                 at any error by the same share; the largest torque stays.
             time: Uniform grid, (time,) [s].
-
-        Raises:
-            InputError: If mujoco is missing, shapes do not fit, the grid is not uniform, or the
-                step is too long for the stiffness of the robot.
         """
         mujoco = load_mujoco()
         _check(drive, len(time), len(self.robot.motors))
@@ -120,9 +114,6 @@ class LiveArms:
         payload: Mass at the tool points, (arm,) [kg].
         weakness: Share of its stiffness that each motor has lost, (arm, motor); None: none.
         pool: A `mujoco.rollout.Rollout` with the engine's threads; None: one of its own.
-
-    Raises:
-        InputError: If mujoco is missing.
     """
 
     def __init__(
@@ -168,9 +159,6 @@ class LiveArms:
 
         Returns:
             (arm, time, motor) [rad].
-
-        Raises:
-            InputError: If the simulation becomes unstable.
         """
         limited = np.concatenate([self._last[:, None], reference * self._sense], axis=1)
         speed = np.array([motor.speed_limit for motor in self._engine.robot.motors])
@@ -261,10 +249,7 @@ class LiveArms:
 def limit_speed(reference: FloatArray, step: float, speed: FloatArray) -> FloatArray:
     """Return references that follow the given ones within a speed limit.
 
-    Args:
-        reference: (run, time, motor) [rad].
-        step: Time between samples [s].
-        speed: Largest speed of each motor, (motor,) [rad/s].
+    References are (run, time, motor) [rad], sampled every `step` [s]; speeds are (motor,) [rad/s].
     """
     largest = speed * step * (1.0 + 1e-9)  # a ramp at exactly this speed is left as it is
     limited = reference.copy()

@@ -57,14 +57,7 @@ def build_model(
 ) -> PhysicsModel:
     """Return the model of a robot.
 
-    Args:
-        robot: The robot.
-        motors: Its motors and gears.
-        step: Time step [s].
-        payload: Mass at the tool point [kg].
-
-    Raises:
-        InputError: If mujoco is missing or cannot use the URDF.
+    The time step is in s; the payload is a mass at the tool point [kg].
     """
     mujoco = load_mujoco()
     spec = arm_spec(robot, payload)

@@ -88,11 +88,7 @@ class PhysicsParameters:
 
 
 def load_parameters(robot: Robot) -> PhysicsParameters | None:
-    """Return the parameters in the file that the robot's profile names; None without one.
-
-    Raises:
-        InputError: If the file cannot be used or does not fit the robot.
-    """
+    """Return the parameters in the file that the robot's profile names; None without one."""
     if robot.profile.physics is None:
         return None
     path = robot.folder / robot.profile.physics
@@ -132,11 +128,7 @@ SPARE_TORQUE = 2.0
 
 
 def default_parameters(robot: Robot) -> PhysicsParameters:
-    """Return parameters derived from the robot's URDF and movement ranges.
-
-    Raises:
-        InputError: If mujoco is missing or cannot use the URDF.
-    """
+    """Return parameters derived from the robot's URDF and movement ranges."""
     load, inertia, effort = _arm_facts(robot)
     figures = np.stack([load, inertia, effort], axis=1).tolist()
     motors = tuple(_assumed(m, *facts) for m, facts in zip(robot.motors, figures, strict=True))

@@ -1,13 +1,18 @@
-"""Check of a URDF before use: its chain, its motors, and findings for the user."""
+"""Check of a URDF before use: its chain, its motors, and findings of three severities.
+
+An error prevents the use of the file; a warning says what is missing or assumed; a note states a
+choice.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
-from failuretwin.core.errors import unknown_name
+from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.digital_model.kinematics import CANNOT_MOVE, farthest_reach, has_range, levers
 from failuretwin.digital_model.urdf.file import (
     HELD_TYPES,
@@ -18,8 +23,92 @@ from failuretwin.digital_model.urdf.file import (
     read_root,
     read_urdf,
 )
-from failuretwin.digital_model.urdf.report import Finding, JointReport, Severity, UrdfReport
 from failuretwin.digital_model.urdf.tool import ToolChoice, choose_tool
+
+Severity = Literal["error", "warning", "note"]
+SEVERITIES = ("error", "warning", "note")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One finding for the user.
+
+    Attributes:
+        severity: ``error``, ``warning`` or ``note``.
+        message: The finding and its fix.
+    """
+
+    severity: Severity
+    message: str
+
+
+@dataclass(frozen=True)
+class JointReport:
+    """One joint of the file and its role.
+
+    Attributes:
+        joint: The joint as the file states it.
+        motor: Name of its motor, if it can move the tool point.
+        reason: Why it has no motor, else empty.
+        mass: Mass of the link that it carries [kg]; None where the file states none.
+    """
+
+    joint: UrdfJoint
+    motor: str | None
+    reason: str
+    mass: float | None
+
+
+@dataclass(frozen=True)
+class UrdfReport:
+    """Contents of a URDF; base, tool and joints are empty where an error hides them.
+
+    Attributes:
+        source: The file.
+        findings: Findings, errors first.
+        name: Name of the robot in the file.
+        base_link: Link that carries the base frame.
+        tool_link: Link whose origin is the tool point.
+        joints: Joints from base to tool, then all others.
+        reach: Largest distance of the tool from the base's origin found [m].
+        moving_mass: Mass carried by the first motor [kg].
+    """
+
+    source: Path
+    findings: tuple[Finding, ...] = ()
+    name: str = ""
+    base_link: str = ""
+    tool_link: str = ""
+    joints: tuple[JointReport, ...] = ()
+    reach: float = 0.0
+    moving_mass: float = 0.0
+
+    @property
+    def motors(self) -> list[JointReport]:
+        """Joints that can move the tool point, in chain order."""
+        return [joint for joint in self.joints if joint.motor is not None]
+
+    @property
+    def others(self) -> list[JointReport]:
+        """Joints that cannot move the tool point."""
+        return [joint for joint in self.joints if joint.motor is None]
+
+    def with_findings(self, more: Iterable[Finding]) -> UrdfReport:
+        """Return the report with more findings, sorted by severity."""
+        known = [*self.findings, *more]
+        known.sort(key=lambda finding: SEVERITIES.index(finding.severity))
+        return replace(self, findings=tuple(known))
+
+    def having(self, severity: Severity) -> list[str]:
+        """Return the messages of one severity."""
+        return [finding.message for finding in self.findings if finding.severity == severity]
+
+    def raise_errors(self) -> None:
+        """Raise InputError with all errors among the findings, if there are any."""
+        errors = self.having("error")
+        if errors:
+            raise InputError(f"{self.source}: " + "\n  also: ".join(errors))
+
 
 SHORT_LEVER_M = 0.01
 """Lever below which a motor's faults are hardly visible [m/rad]."""
@@ -42,16 +131,9 @@ def check_urdf(
 ) -> UrdfReport:
     """Return the report on a URDF; its kinematics need no meshes, inertias or mimic joints.
 
-    Args:
-        path: The file.
-        base: Link that carries the base frame; None: the root.
-        tool: Link whose origin is the tool point; None: by its name, else the end of the branch
-            with the most moving joints.
-        noise_m: Noise of the tool sensor [m]; a joint with a shorter lever has no motor.
-
-    Raises:
-        InputError: If the file cannot be read, is not XML, is a xacro template or not a URDF, or
-            there is no chain from `base` to `tool`. All other problems become findings.
+    Without a base the root carries the base frame. Without a tool it is found by its name, else it
+    is the end of the branch with the most moving joints. A joint whose lever is below the noise of
+    the tool sensor, `noise_m` [m], has no motor.
     """
     report = UrdfReport(path).with_findings(_file_findings(path))
     if report.having("error"):

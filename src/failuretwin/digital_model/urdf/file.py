@@ -141,11 +141,7 @@ class Urdf:
         return steps
 
     def path(self, base_link: str, tool_link: str) -> tuple[UrdfJoint, ...]:
-        """Return the joints from `base_link` to `tool_link`, in that order.
-
-        Raises:
-            InputError: If a link does not exist or no chain leads to the tool.
-        """
+        """Return the joints from `base_link` to `tool_link`, in that order."""
         for link in (base_link, tool_link):
             if link not in self.links:
                 raise InputError(f"{self.source}: {unknown_name('link', link, self.links)}")
@@ -162,11 +158,7 @@ class Urdf:
         return tuple(reversed(way))
 
     def chain(self, base_link: str, tool_link: str, moving: Collection[str]) -> SerialChain:
-        """Return the chain to the tool link with the joints `moving`; other joints stay at zero.
-
-        Raises:
-            InputError: If a named joint is not on the path or of a type that cannot move.
-        """
+        """Return the chain to the tool link with the joints `moving`; other joints stay at zero."""
         path = self.path(base_link, tool_link)
         types = {joint.name: joint.type for joint in path}
         for name in moving:
@@ -191,11 +183,7 @@ class Urdf:
         return SerialChain(tuple(joints), _snap(T))
 
     def with_joints(self, changes: Mapping[str, Callable[[UrdfJoint], UrdfJoint]]) -> Urdf:
-        """Return a copy with some joints changed, by name.
-
-        Raises:
-            InputError: If there is no such joint.
-        """
+        """Return a copy with some joints changed, by name."""
         names = {joint.name for joint in self.joints}
         for name in changes:
             if name not in names:
@@ -242,11 +230,7 @@ def _snap(T: FloatArray) -> FloatArray:
 
 
 def read_urdf(path: Path) -> Urdf:
-    """Read links and joints of a URDF file.
-
-    Raises:
-        InputError: If the file is missing, not XML, not a URDF, or a joint is malformed.
-    """
+    """Read links and joints of a URDF file."""
     root = read_root(path)
     facts = {link.get("name", ""): _read_link(link) for link in root.findall("link")}
     links = tuple(link.get("name", "") for link in root.findall("link"))
@@ -255,11 +239,7 @@ def read_urdf(path: Path) -> Urdf:
 
 
 def read_root(path: Path) -> ElementTree.Element:
-    """Return the <robot> element of a URDF file.
-
-    Raises:
-        InputError: If the file is missing, a profile, not XML, a xacro template or not a URDF.
-    """
+    """Return the <robot> element of a URDF file."""
     if path.suffix == ".toml":
         raise InputError(
             f"{path}: is the profile of a robot, expected its URDF. A profile is checked wherever "
