@@ -86,9 +86,12 @@ def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior, unfit: bool) -> list[str
     from failuretwin.inference.calibration_fit import calibration_told, fits_this_robot
 
     usable = seen.evidence.settled.usable
+    way = seen.settled.moments_on_the_way
+    on_way = f", {counted(way, 'moment')} on its way" if way else ""
     lines = [
         f"log: {counted(len(usable), 'run')}, {counted(int(usable.sum()), 'movement')} after which "
-        f"the tool is seen at rest, {measured_rate(seen.runs):.3g} readings a second"
+        f"the tool is seen at rest{on_way}, "
+        f"{measured_rate(seen.runs):.3g} readings a second"
     ]
     undone = seen.under(set_ups.best.set_up.correction)
     fits = fits_this_robot(undone) if set_ups.fits and not unfit else None

@@ -198,6 +198,11 @@ class SettledEvidence(ArrayStruct):
         return Stretches.of(self.movements).on_the_way
 
     @property
+    def moments_on_the_way(self) -> int:
+        """How many readings on the way stand for movements without a rest."""
+        return int((self.usable & ~Stretches.of(self.movements).at_rest).sum())
+
+    @property
     def numbers(self) -> IntArray:
         """Number of each movement in its run, from 1, (run, movement)."""
         return Stretches.of(self.movements).movement + 1
