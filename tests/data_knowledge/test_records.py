@@ -14,6 +14,7 @@ import failuretwin as ft
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.data_knowledge.records.log_files import LogFile, log_file
 from failuretwin.data_knowledge.records.queries import QUESTIONS
+from failuretwin.data_knowledge.records.rows import Basis
 from store_places import diagnosis
 
 DAY = datetime(2026, 3, 2, tzinfo=UTC)
@@ -330,12 +331,15 @@ def test_a_robot_without_time_has_no_time_between_failures(store):
 def test_the_history_lists_the_last_runs_and_counts_all(store):
     told = [diagnosis(f"run_{k}", "healthy") for k in range(30)]
     store.remember(told, "arm_7", log=a_log(0))
+    store.begin("arm_7", Basis("import"))  # counts nothing
+    store.remember([diagnosis("run_30", "motor_1:stuck")], "arm_8")
+    store.remember(told[:1], "arm_7", log=a_log(0))  # known before
     found = store.history("arm_7")
     assert found.counts == {"healthy": 30}
     assert [one.run for one in found.recent] == [f"run_{k}" for k in range(10, 30)]
     assert found.health == "no open fault; last run (2026-03-02): healthy"
-    with pytest.raises(InputError, match=r"unknown robot 'arm_8'. Did you mean 'arm_7'"):
-        store.history("arm_8")
+    with pytest.raises(InputError, match=r"unknown robot 'arm_9'. Did you mean 'arm_8'"):
+        store.history("arm_9")
 
 
 def test_pandas_reads_every_table_of_the_export(store, place, armpi, tmp_path):

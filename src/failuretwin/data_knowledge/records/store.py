@@ -137,7 +137,8 @@ class Store(StoreReader):
                     if run not in seen:
                         tracker.follow(diagnosis, source.recorded, number)
             basis = Basis(command, calibration, diagnoses[0].method, diagnoses[0].protocol)
-            of = SessionRows(writing.add_session(connection, row, basis), row)
+            states = (one.state for one, _, _ in kept)
+            of = SessionRows(writing.add_session(connection, row, basis, states), row)
             rows = writing.add_diagnoses(connection, of, kept, source.recorded)
             add_offsets(connection, of, source.recorded, offsets)
             changed = writing.keep_episodes(connection, row, tracker.changed, rows)

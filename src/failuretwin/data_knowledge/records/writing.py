@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -22,7 +23,7 @@ from failuretwin.data_knowledge.records.episodes import (
     EpisodeTracker,
     NamedFault,
 )
-from failuretwin.data_knowledge.records.history import read_episodes
+from failuretwin.data_knowledge.records.history import read_counts, read_episodes
 from failuretwin.data_knowledge.records.log_files import LogFile
 from failuretwin.data_knowledge.records.rows import Basis, SessionRows, add_rows
 from failuretwin.data_knowledge.records.schema import (
@@ -170,11 +171,21 @@ def keep_runs(
 # Sessions.
 
 
-def add_session(connection: sa.Connection, robot: int, basis: Basis) -> int:
-    """Return the row of a new session."""
+def add_session(
+    connection: sa.Connection, robot: int, basis: Basis, states: Iterable[str] = ()
+) -> int:
+    """Return the row of a new session, of a robot that other writers are kept from.
+
+    Args:
+        connection: Connection to the store.
+        robot: Row of the robot.
+        basis: What the session rests on.
+        states: States of the diagnoses of runs that it adds.
+    """
+    diagnosed = Counter(read_counts(connection, robot)) + Counter(states)
     stated: dict[str, Any] = {"robot_id": robot, "calibration_id": basis.calibration}
     stated |= {"begun": datetime.now(UTC), "version": __version__, "command": basis.command}
-    stated |= {"method": basis.method, "protocol": basis.protocol}
+    stated |= {"method": basis.method, "protocol": basis.protocol, "diagnosed": diagnosed}
     return add_rows(connection, sessions, [stated])[0]
 
 
