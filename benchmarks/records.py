@@ -154,7 +154,9 @@ def copying(table: sa.Table, last: Mapping[str, int], number: int, later: str) -
             return f"{own} + {later}"
         if column.name == "diagnosed":
             return COUNTS.replace("COPY", str(number))
-        return f"{own} || '.{number}'" if column.name == "sha256" else own
+        if column.name == "sha256":
+            return f"repeat(md5(({table.name}.id + {number * last[table.name]})::text), 2)"
+        return own
 
     cells = ", ".join(map(cell, table.columns))
     names = ", ".join(table.columns.keys())

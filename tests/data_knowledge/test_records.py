@@ -328,6 +328,17 @@ def test_a_robot_without_time_has_no_time_between_failures(store):
     assert store.query("time-between-failures").rows == (("", "motor_1", 1, 0.0, 1, None),)
 
 
+def test_a_log_is_remembered_part_by_part(place, store):
+    for _ in range(2):  # the second time all is known
+        for first in (0, 3, 6):
+            told = [diagnosis(f"run_{k}", "healthy") for k in range(first, min(first + 3, 8))]
+            done = store.remember(told, "arm_7", log=a_log(0), first=first)
+    assert (done.added, done.known) == (0, 2)
+    rows = place.sql("SELECT position, name FROM runs ORDER BY id")
+    assert [(int(position), name) for position, name in rows] == [(k, f"run_{k}") for k in range(8)]
+    assert store.history("arm_7").counts == {"healthy": 8}
+
+
 def test_the_history_lists_the_last_runs_and_counts_all(store):
     told = [diagnosis(f"run_{k}", "healthy") for k in range(30)]
     store.remember(told, "arm_7", log=a_log(0))

@@ -116,8 +116,9 @@ class RobotRecord:
         runs: xr.Dataset | None = None,
         command: str = "diagnose",
         offsets: Sequence[MotorOffset] = (),
+        first: int = 0,
     ) -> Remembered:
-        """Store the diagnoses of one log."""
+        """Store diagnoses of one log, from its run number `first` on."""
         return self.store.remember(
             diagnoses,
             self.name,
@@ -127,6 +128,7 @@ class RobotRecord:
             calibration=self.calibration_number,
             command=command,
             offsets=offsets,
+            first=first,
         )
 
     def tracked_rows(self) -> tuple[dict[str, Any], ...]:

@@ -151,15 +151,20 @@ def keep_log(connection: sa.Connection, robot: int, log: LogFile) -> StoredLog:
 
 
 def keep_runs(
-    connection: sa.Connection, log: StoredLog, names: Sequence[str], details: Sequence[Any]
+    connection: sa.Connection,
+    log: StoredLog,
+    names: Sequence[str],
+    details: Sequence[Any],
+    first: int = 0,
 ) -> list[int]:
-    """Return the rows of the runs of a log, in its order."""
+    """Return the rows of the runs of a log, in its order, from number `first` on."""
     query = sa.select(runs.c.position, runs.c.name, runs.c.id).where(runs.c.log_id == log.row)
+    query = query.where(runs.c.position.between(first, first + len(names) - 1))
     stored = [] if log.new else connection.execute(query).all()
     known = {(one.position, one.name): one.id for one in stored}
-    wanted = list(enumerate(map(storable, names)))
+    wanted = list(enumerate(map(storable, names), first))
     rows = [
-        {"log_id": log.row, "position": k, "name": name, "details": details[k]}
+        {"log_id": log.row, "position": k, "name": name, "details": details[k - first]}
         for k, name in wanted
         if (k, name) not in known
     ]
@@ -203,7 +208,7 @@ def new_diagnoses(
     calibration: int | None,
 ) -> tuple[Kept, set[int]]:
     """Return the diagnoses that are not stored yet, and the runs that have one already."""
-    known = set() if log.new else _stored_digests(connection, log.row)
+    known = set() if log.new else _stored_digests(connection, run_rows)
     each = [
         (one, row, _digest_of(one, calibration))
         for one, row in zip(diagnoses, run_rows, strict=True)
@@ -245,9 +250,10 @@ def _digest_of(diagnosis: Diagnosis, calibration: int | None) -> str:
     return text_checksum(json.dumps(record, sort_keys=True))
 
 
-def _stored_digests(connection: sa.Connection, log: int) -> set[tuple[int, str]]:
-    """Return run and digest of all diagnoses of a log."""
-    query = sa.select(diagnoses.c.run_id, diagnoses.c.digest).join(runs).where(runs.c.log_id == log)
+def _stored_digests(connection: sa.Connection, run_rows: Sequence[int]) -> set[tuple[int, str]]:
+    """Return run and digest of all diagnoses of some runs of one log."""
+    query = sa.select(diagnoses.c.run_id, diagnoses.c.digest)
+    query = query.where(diagnoses.c.run_id.between(min(run_rows), max(run_rows)))
     return {(one.run_id, one.digest) for one in connection.execute(query)}
 
 
