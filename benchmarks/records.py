@@ -7,7 +7,7 @@ now and then, and half of the faults are confirmed. History and questions are as
 each from a store that has just been opened; the table states median and 99 % quantile.
 
 --copies N multiplies what was filled: the rows are copied N times by SQL, later and with identities
-of their own, without the checks of references (PostgreSQL, as superuser).
+of their own (PostgreSQL: as superuser, without the checks of references).
 """
 
 from __future__ import annotations
@@ -108,38 +108,44 @@ def day(rng: np.random.Generator, motors: list[str]) -> list[ft.Diagnosis]:
 COPIED = ("logs", "runs", "sessions", "diagnoses", "episodes", "episode_events", "findings")
 """Tables that grow with the runs, each behind those that it refers to."""
 TOTALS = """
-CREATE TEMP TABLE totals ON COMMIT DROP AS
-SELECT DISTINCT ON (robot_id) robot_id, diagnosed FROM sessions ORDER BY robot_id, id DESC
+CREATE TEMP TABLE totals AS SELECT robot_id, diagnosed FROM sessions
+WHERE id IN (SELECT max(id) FROM sessions GROUP BY robot_id)
 """
 COUNTS = """(
-    SELECT jsonb_object_agg(key, value::bigint + COPY * (total.diagnosed -> key)::bigint)
-    FROM totals AS total, jsonb_each(sessions.diagnosed)
-    WHERE total.robot_id = sessions.robot_id
+    SELECT AGGREGATE(key, CAST(value AS BIGINT) + COPY * CAST(totals.diagnosed ->> key AS BIGINT))
+    FROM totals, EACH(sessions.diagnosed) WHERE totals.robot_id = sessions.robot_id
 )"""
 """What a session counts, after all runs of the copies before it."""
+SQLITE = {"AGGREGATE": "json_group_object", "EACH": "json_each"}
+POSTGRES = {"AGGREGATE": "jsonb_object_agg", "EACH": "jsonb_each"}
 
 
 def copy(url: str, copies: int) -> None:
     """Copy the rows of a store by SQL, each time later, and print rows a second."""
-    begun = time.perf_counter()
-    with Database(url).writing() as connection:
+    begun, database = time.perf_counter(), Database(url)
+    at = metadata.tables["diagnoses"].c.at
+    with database.writing() as connection:
         tell = connection.exec_driver_sql
         tell("UPDATE episodes SET until = since WHERE until IS NULL")
-        tell("SET LOCAL session_replication_role = replica")
+        if database.file is None:
+            tell("SET LOCAL session_replication_role = replica")
         tell(TOTALS)
         last = {name: int(tell(f"SELECT max(id) FROM {name}").scalar() or 0) for name in COPIED}
-        span = tell("SELECT max(at) - min(at) + '1 hour' FROM diagnoses").scalar_one()
+        first, end = connection.execute(sa.select(sa.func.min(at), sa.func.max(at))).one()
+        span_s = (end - first).total_seconds() + 3600.0
         for number in range(1, copies + 1):
-            later = f"interval '{number * span.total_seconds()} seconds'"
             for name in COPIED:
-                tell(copying(metadata.tables[name], last, number, later))
-        for name in COPIED:
+                given = (number, number * span_s, database.file is not None)
+                tell(copying(metadata.tables[name], last, *given))
+        for name in COPIED if database.file is None else ():
             tell(f"SELECT setval('{name}_id_seq', (SELECT max(id) FROM {name}))")
     spent = time.perf_counter() - begun
     print(f"copied: {copies * last['runs'] / spent:,.0f} runs a second")
 
 
-def copying(table: sa.Table, last: Mapping[str, int], number: int, later: str) -> str:
+def copying(
+    table: sa.Table, last: Mapping[str, int], number: int, later_s: float, sqlite: bool
+) -> str:
     """Return the statement that copies the first rows of a table with identities of their own."""
 
     def cell(column: sa.Column[Any]) -> str:
@@ -151,19 +157,20 @@ def copying(table: sa.Table, last: Mapping[str, int], number: int, later: str) -
         if target in last:
             return f"{own} + {number * last[target]}"
         if isinstance(column.type, Utc):
-            return f"{own} + {later}"
+            later = f"strftime('%Y-%m-%d %H:%M:%f000', {own}, '+{later_s:.0f} seconds')"
+            return later if sqlite else f"{own} + interval '{later_s:.0f} seconds'"
         if column.name == "diagnosed":
-            return COUNTS.replace("COPY", str(number))
+            counts = COUNTS.replace("COPY", str(number))
+            for name, function in (SQLITE if sqlite else POSTGRES).items():
+                counts = counts.replace(name, function)
+            return counts
         if column.name == "sha256":
-            return f"repeat(md5(({table.name}.id + {number * last[table.name]})::text), 2)"
+            return f"'{'c' * 56}' || CAST({table.name}.id + {number * last[table.name]} AS TEXT)"
         return own
 
-    cells = ", ".join(map(cell, table.columns))
-    names = ", ".join(table.columns.keys())
-    return (
-        f"INSERT INTO {table.name} ({names}) "
-        f"SELECT {cells} FROM {table.name} WHERE id <= {last[table.name]}"
-    )
+    cells, names = ", ".join(map(cell, table.columns)), ", ".join(table.columns.keys())
+    rows = f"SELECT {cells} FROM {table.name} WHERE id <= {last[table.name]}"
+    return f"INSERT INTO {table.name} ({names}) {rows}"
 
 
 def answered(url: str, question: str) -> object:
