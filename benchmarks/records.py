@@ -1,10 +1,13 @@
 """Speed of the store: rows a second in, bytes a run, history and ready questions.
 
-    python benchmarks/records.py [--url URL] [--runs 100000] [--robots 20] [--calls 50]
+    python benchmarks/records.py [--url URL] [--runs 100000] [--robots 20] [--calls 50] [--copies 0]
 
 Without --url: an SQLite file in a temporary folder. A log holds 100 runs; each robot has a fault
 now and then, and half of the faults are confirmed. History and questions are asked CALLS times,
 each from a store that has just been opened; the table states median and 99 % quantile.
+
+--copies N multiplies what was filled: the rows are copied N times by SQL, later and with identities
+of their own (PostgreSQL: as superuser, without the checks of references).
 """
 
 from __future__ import annotations
@@ -12,10 +15,11 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
@@ -25,6 +29,7 @@ from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.records.database import Database
 from failuretwin.data_knowledge.records.log_files import LogFile
 from failuretwin.data_knowledge.records.queries import QUESTIONS
+from failuretwin.data_knowledge.records.schema import Utc, metadata
 
 LOG_RUNS = 100
 FAULT_SHARE = 0.02
@@ -39,20 +44,27 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=100_000)
     parser.add_argument("--robots", type=int, default=20)
     parser.add_argument("--calls", type=int, default=50)
+    parser.add_argument("--copies", type=int, default=0)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         url = options.url or str(Path(folder) / "robots.db")
         store = ft.open_store(url, create=True)
         fill(store, options.runs, options.robots)
-        size = stored_bytes(url)
-        print(f"bytes a run: {size / options.runs:.0f} ({size / 1e6:.0f} MB)")
-        last = f"arm_{options.robots - 1}"
-        report("history", options.calls, lambda: ft.open_store(url).history(last))
-        for name in QUESTIONS:
-            report(name, options.calls, partial(answered, url, name))
+        if options.copies:
+            copy(url, options.copies)
+        measure(url, options.runs * (1 + options.copies), options.robots, options.calls)
         begun = time.perf_counter()
         rows = sum(store.export(Path(folder) / "tables").values())
         print(f"export: {rows / (time.perf_counter() - begun):,.0f} rows a second")
+
+
+def measure(url: str, runs: int, robots: int, calls: int) -> None:
+    """Print the size of a store, and the times of its answers."""
+    size = stored_bytes(url)
+    print(f"bytes a run: {size / runs:.0f} ({size / 1e6:.0f} MB)")
+    report("history", calls, lambda: ft.open_store(url).history(f"arm_{robots - 1}"))
+    for name in QUESTIONS:
+        report(name, calls, partial(answered, url, name))
 
 
 def fill(store: ft.Store, runs: int, robots: int) -> None:
@@ -91,6 +103,74 @@ def day(rng: np.random.Generator, motors: list[str]) -> list[ft.Diagnosis]:
         table = dict(zip(names, posterior.tolist(), strict=True))
         found.append(ft.Diagnosis(f"run_{run}", table, onset_s=0.5, verdict=f"{names[true]}, 99 %"))
     return found
+
+
+COPIED = ("logs", "runs", "sessions", "diagnoses", "episodes", "episode_events", "findings")
+"""Tables that grow with the runs, each behind those that it refers to."""
+TOTALS = """
+CREATE TEMP TABLE totals AS SELECT robot_id, diagnosed FROM sessions
+WHERE id IN (SELECT max(id) FROM sessions GROUP BY robot_id)
+"""
+COUNTS = """(
+    SELECT AGGREGATE(key, CAST(value AS BIGINT) + COPY * CAST(totals.diagnosed ->> key AS BIGINT))
+    FROM totals, EACH(sessions.diagnosed) WHERE totals.robot_id = sessions.robot_id
+)"""
+"""What a session counts, after all runs of the copies before it."""
+SQLITE = {"AGGREGATE": "json_group_object", "EACH": "json_each"}
+POSTGRES = {"AGGREGATE": "jsonb_object_agg", "EACH": "jsonb_each"}
+
+
+def copy(url: str, copies: int) -> None:
+    """Copy the rows of a store by SQL, each time later, and print rows a second."""
+    begun, database = time.perf_counter(), Database(url)
+    at = metadata.tables["diagnoses"].c.at
+    with database.writing() as connection:
+        tell = connection.exec_driver_sql
+        tell("UPDATE episodes SET until = since WHERE until IS NULL")
+        if database.file is None:
+            tell("SET LOCAL session_replication_role = replica")
+        tell(TOTALS)
+        last = {name: int(tell(f"SELECT max(id) FROM {name}").scalar() or 0) for name in COPIED}
+        first, end = connection.execute(sa.select(sa.func.min(at), sa.func.max(at))).one()
+        span_s = (end - first).total_seconds() + 3600.0
+        for number in range(1, copies + 1):
+            for name in COPIED:
+                given = (number, number * span_s, database.file is not None)
+                tell(copying(metadata.tables[name], last, *given))
+        for name in COPIED if database.file is None else ():
+            tell(f"SELECT setval('{name}_id_seq', (SELECT max(id) FROM {name}))")
+    spent = time.perf_counter() - begun
+    print(f"copied: {copies * last['runs'] / spent:,.0f} runs a second")
+
+
+def copying(
+    table: sa.Table, last: Mapping[str, int], number: int, later_s: float, sqlite: bool
+) -> str:
+    """Return the statement that copies the first rows of a table with identities of their own."""
+
+    def cell(column: sa.Column[Any]) -> str:
+        own = f"{table.name}.{column.name}"
+        refers = [key.column.table.name for key in column.foreign_keys]
+        target = table.name if column.name == "id" else next(iter(refers), "")
+        if column.name == "number":
+            target = "episodes"
+        if target in last:
+            return f"{own} + {number * last[target]}"
+        if isinstance(column.type, Utc):
+            later = f"strftime('%Y-%m-%d %H:%M:%f000', {own}, '+{later_s:.0f} seconds')"
+            return later if sqlite else f"{own} + interval '{later_s:.0f} seconds'"
+        if column.name == "diagnosed":
+            counts = COUNTS.replace("COPY", str(number))
+            for name, function in (SQLITE if sqlite else POSTGRES).items():
+                counts = counts.replace(name, function)
+            return counts
+        if column.name == "sha256":
+            return f"'{'c' * 56}' || CAST({table.name}.id + {number * last[table.name]} AS TEXT)"
+        return own
+
+    cells, names = ", ".join(map(cell, table.columns)), ", ".join(table.columns.keys())
+    rows = f"SELECT {cells} FROM {table.name} WHERE id <= {last[table.name]}"
+    return f"INSERT INTO {table.name} ({names}) {rows}"
 
 
 def answered(url: str, question: str) -> object:

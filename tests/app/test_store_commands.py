@@ -49,9 +49,9 @@ AT = ("--recorded", "2026-03-02T14:30")
 def test_a_store_is_made_once_and_checked(run, store, tmp_path):
     before = (tmp_path / "robots.db").read_bytes()
     assert run("store", "init", *store).startswith("the store: robots.db\n")
-    assert run("store", "upgrade", *store) == "robots.db: is up to date (revision 4)\n"
+    assert run("store", "upgrade", *store) == "robots.db: is up to date (revision 5)\n"
     assert (tmp_path / "robots.db").read_bytes() == before
-    assert run("store", "check", *store) == "robots.db: revision 4; empty\nno problems\n"
+    assert run("store", "check", *store) == "robots.db: revision 5; empty\nno problems\n"
 
 
 def test_diagnoses_are_remembered_with_their_log(run, store, rows, tmp_path):

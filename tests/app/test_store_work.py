@@ -10,8 +10,9 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from failuretwin.app.shadow import Change, Snapshot
 from failuretwin.app.watch_keeper import begin_watch
 from failuretwin.connection.life_history import read_rows
 from failuretwin.connection.links.base import OK, Answer
+from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import ALL_CLEAR, RAISED, Alarm
 from failuretwin.data_knowledge.records.rows import Basis
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
@@ -139,6 +141,39 @@ def test_what_a_killed_watch_has_told_is_stored(store, place, tmp_path):
     assert stored[1 : 1 + len(lines)] == lines
     assert [one.state for one in store.history("arm_7").episodes] == ["raised"]
     assert store.check().problems == ()
+
+
+def test_a_killed_act_keeps_what_it_has_done(file, tmp_path):
+    store = ft.open_store(file, create=True)
+    targets = ("-0.064,0.160,0.168", "0.146,-0.122,0.212", "0.022,-0.181,0.208") * 40
+    (tmp_path / "task.csv").write_text("\n".join(("x,y,z", *targets)))
+    command = [sys.executable, "-m", "failuretwin", "act", "task.csv", "--store", file, *NAME]
+    command += ["--fault", "motor_3:stuck=-0.4"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as child:
+        told = ""
+        while "target (" not in told:
+            assert child.poll() is None
+            time.sleep(0.05)
+            with suppress(InputError):  # the robot is not known yet
+                told = "\n".join(texts(store.history("arm_7"), "act"))
+        os.kill(child.pid, signal.SIGKILL)
+    assert [one.motor for one in store.history("arm_7").episodes] == ["motor_3"]
+    assert "ALARM: motor 3 stuck" in told
+    assert store.check().problems == ()
+
+
+def test_work_goes_on_while_its_store_is_locked(run, file, tmp_path):
+    store = ft.open_store(file, create=True)
+    (tmp_path / "task.csv").write_text("x,y,z\n0.15,0.0,0.15\n")
+    with closing(sqlite3.connect(file, check_same_thread=False)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        release = threading.Timer(8.0, other.rollback)
+        release.start()
+        told = run("act", "task.csv", "--store", file, *NAME)
+        release.join()
+    assert "remembered in" in told.stdout
+    (done,) = texts(store.history("arm_7"), "act")
+    assert done.startswith("target (0.150, 0.000, 0.150) m: reached after")
 
 
 # The keeper of a watch.

@@ -71,6 +71,9 @@ def test_diagnoses_are_stored_as_whole_calls(place, store, delays):
         calls = found[0]
         assert told <= calls <= told + 1
         assert found == [calls, calls, RUNS * calls, (calls + 1) // 2, 0, RUNS * calls, calls]
+        if calls:
+            stated = store.history(f"arm {kill}").counts
+            assert sum(stated.values()) == RUNS * calls
     assert store.check().problems == ()
 
 

@@ -14,6 +14,7 @@ import failuretwin as ft
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.data_knowledge.records.log_files import LogFile, log_file
 from failuretwin.data_knowledge.records.queries import QUESTIONS
+from failuretwin.data_knowledge.records.rows import Basis
 from store_places import diagnosis
 
 DAY = datetime(2026, 3, 2, tzinfo=UTC)
@@ -327,15 +328,29 @@ def test_a_robot_without_time_has_no_time_between_failures(store):
     assert store.query("time-between-failures").rows == (("", "motor_1", 1, 0.0, 1, None),)
 
 
+def test_a_log_is_remembered_part_by_part(place, store):
+    for _ in range(2):  # the second time all is known
+        for first in (0, 3, 6):
+            told = [diagnosis(f"run_{k}", "healthy") for k in range(first, min(first + 3, 8))]
+            done = store.remember(told, "arm_7", log=a_log(0), first=first)
+    assert (done.added, done.known) == (0, 2)
+    rows = place.sql("SELECT position, name FROM runs ORDER BY id")
+    assert [(int(position), name) for position, name in rows] == [(k, f"run_{k}") for k in range(8)]
+    assert store.history("arm_7").counts == {"healthy": 8}
+
+
 def test_the_history_lists_the_last_runs_and_counts_all(store):
     told = [diagnosis(f"run_{k}", "healthy") for k in range(30)]
     store.remember(told, "arm_7", log=a_log(0))
+    store.begin("arm_7", Basis("import"))  # counts nothing
+    store.remember([diagnosis("run_30", "motor_1:stuck")], "arm_8")
+    store.remember(told[:1], "arm_7", log=a_log(0))  # known before
     found = store.history("arm_7")
     assert found.counts == {"healthy": 30}
     assert [one.run for one in found.recent] == [f"run_{k}" for k in range(10, 30)]
     assert found.health == "no open fault; last run (2026-03-02): healthy"
-    with pytest.raises(InputError, match=r"unknown robot 'arm_8'. Did you mean 'arm_7'"):
-        store.history("arm_8")
+    with pytest.raises(InputError, match=r"unknown robot 'arm_9'. Did you mean 'arm_8'"):
+        store.history("arm_9")
 
 
 def test_pandas_reads_every_table_of_the_export(store, place, armpi, tmp_path):

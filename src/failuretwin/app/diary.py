@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -16,48 +16,49 @@ from failuretwin.decision.acting.task import TargetResult
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 
 if TYPE_CHECKING:
-    from failuretwin.app.remembering import RobotRecord
+    from failuretwin.app.remembering import RobotRecord, WorkKeeper
 
 
-@dataclass
+@dataclass(frozen=True)
 class Diary:
-    """Entries about the work of an arm, in their order; calling it tells a line.
+    """What is said of the work of an arm, as it happens; calling it tells a line.
 
     Attributes:
-        entries: The entries so far: when (UTC), and a sentence or a change of the alarm.
+        keeper: What stores the entries; None: nothing does.
     """
 
-    entries: list[tuple[datetime, str | AlarmChange]] = field(default_factory=list)
+    keeper: WorkKeeper | None
 
     def __call__(self, text: str) -> None:
         """Tell a line and note it."""
         self.note(text)
         tell(text)
 
-    def note(self, *entries: str | AlarmChange) -> None:
-        """Note entries."""
-        self.entries += [(datetime.now(UTC), entry) for entry in entries]
+    def note(self, entry: str | AlarmChange | TargetResult) -> None:
+        """Note a sentence, a change of the alarm, or what became of a target."""
+        if self.keeper is not None:
+            text = target_line(entry) if isinstance(entry, TargetResult) else entry
+            self.keeper.keep(datetime.now(UTC), text)
 
 
 @contextmanager
 def noting(
     stored: RobotRecord | None, command: str, known: CalibratedRobot, method: str
 ) -> Iterator[Diary]:
-    """Give a diary, which is stored as a session when the work is over.
+    """Give a diary, which is stored as a session as the work goes on.
 
-    It is stored too where an error or Ctrl-C ends the work, with the reason. An arm never waits
-    for the store.
+    Where an error or Ctrl-C ends the work, it holds the reason.
     """
-    diary = Diary()
+    keeper = None if stored is None else stored.work_keeper(command, known, method)
+    diary = Diary(keeper)
     try:
         yield diary
     except (InputError, KeyboardInterrupt) as error:
         diary.note(f"ended: {error or 'Ctrl-C'}")
         raise
     finally:
-        if stored is not None:
-            for line in stored.remember_work(command, known, method, diary.entries):
-                tell(line)
+        for line in () if keeper is None else keeper.end():
+            tell(line)
 
 
 def target_line(result: TargetResult) -> str:

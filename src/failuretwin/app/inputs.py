@@ -19,6 +19,7 @@ from failuretwin.data_knowledge.readers.lerobot import is_lerobot, lerobot_map_t
 from failuretwin.data_knowledge.readers.lerobot_units import GUESSED, LeRobotAngles
 from failuretwin.data_knowledge.readers.matlab import RECOVERY_ERROR, RECOVERY_WORST
 from failuretwin.data_knowledge.readers.read import ReadOptions, find_logs, read_logs
+from failuretwin.data_knowledge.run_pieces import RunPieces
 from failuretwin.data_knowledge.store import write_text
 from failuretwin.data_knowledge.workers import ONE_PROCESS, Workforce
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
@@ -27,7 +28,7 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser, diagnoser_from_text
-from failuretwin.inference.explanation import with_reading_doubt
+from failuretwin.inference.explanation import with_learned_method, with_reading_doubt
 from failuretwin.inference.observation.computed_tool import is_computed
 from failuretwin.inference.posterior import check_diagnosable
 from failuretwin.inference.set_ups.log_correction import CorrectionTable, LogCorrection
@@ -68,13 +69,38 @@ def read_inputs(
     return runs
 
 
+def read_some(
+    logs: Sequence[Path], robot: Robot, options: ReadOptions, columns: Path | None, most: int
+) -> xr.Dataset:
+    """Return the runs of all logs; of more than `most`, so many evenly spread ones, and say so.
+
+    Raises:
+        InputError: If they cannot be read.
+    """
+    mapped, correction = with_map(options, columns, logs, robot)
+    every = RunPieces(logs, robot, mapped)
+    if every.size <= most:
+        return read_inputs(logs, robot, options, columns)
+    runs = every.sample(most)
+    tell(f"note: {runs.sizes['run']} of {every.size} runs are used, evenly spread", err=True)
+    return runs if correction is None else correction.runs(runs)
+
+
 def with_doubts(
-    diagnoses: Sequence[Diagnosis], runs: xr.Dataset, twin: DigitalTwin
+    diagnoses: Sequence[Diagnosis], runs: xr.Dataset, twin: DigitalTwin, learned: bool = False
 ) -> list[Diagnosis]:
-    """Return diagnoses with a caveat if the tool path was computed from motor readings."""
-    if not is_computed(runs, twin):
-        return list(diagnoses)
-    return [with_reading_doubt(one, one.diagnosis or "") for one in diagnoses]
+    """Return diagnoses with what else is to be said of their runs.
+
+    Args:
+        diagnoses: The diagnoses.
+        runs: Their runs; a tool path that was computed from motor readings needs a caveat.
+        twin: The robot.
+        learned: Whether their priors were learned.
+    """
+    said = list(diagnoses)
+    if is_computed(runs, twin):
+        said = [with_reading_doubt(one, one.diagnosis or "") for one in said]
+    return [with_learned_method(one) for one in said] if learned else said
 
 
 def warn_mismatch(runs: xr.Dataset, expected: str) -> None:

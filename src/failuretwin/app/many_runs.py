@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from failuretwin.app.inputs import with_map
+from failuretwin.app.learning import Start, check_learning_from, self_calibrated
 from failuretwin.app.reports.reports import score_parts
 from failuretwin.app.terminal import Part, figures_table, progress_bar, tell
 from failuretwin.core.errors import counted
@@ -19,6 +20,8 @@ from failuretwin.decision.evaluation import Judged
 from failuretwin.decision.results import read_diagnoses
 from failuretwin.decision.scoring import NO_VERDICT
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.observation.sensors import sensing_of
+from failuretwin.inference.set_ups.log_correction import LogCorrection
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -30,13 +33,23 @@ STATES = (HEALTHY_STATE, FAULTY_STATE, OPEN_STATE)
 
 
 def diagnose_many(
-    reading: LogOptions, bayes: BayesDiagnoser, folder: Path, workforce: Workforce
+    reading: LogOptions,
+    bayes: BayesDiagnoser,
+    folder: Path,
+    workforce: Workforce,
+    start: Start | None = None,
 ) -> list[Part]:
-    """Diagnose runs of any number into a folder of parquet files, and return a summary."""
+    """Diagnose runs of any number into a folder of parquet files, and return a summary.
+
+    `start` is what a calibration that is learned from a sample of the runs begins with; None: none
+    is learned.
+    """
     robot = bayes.twin.robot
     options, correction = with_map(reading.options, reading.columns, reading.logs, robot)
     runs = RunPieces(reading.logs, robot, options)
-    with progress_bar("diagnosing", sum(piece.size for piece in runs.pieces)) as advance:
+    if start is not None:
+        bayes = _taught(runs, correction, bayes, start)
+    with progress_bar("diagnosing", runs.size) as advance:
         diagnose_to_parquet(
             runs,
             bayes,
@@ -50,6 +63,22 @@ def diagnose_many(
     return _summary(folder)
 
 
+def _taught(
+    runs: RunPieces, correction: LogCorrection | None, bayes: BayesDiagnoser, start: Start
+) -> BayesDiagnoser:
+    """Return a diagnoser with what a sample of runs teaches of the robot, and say so."""
+    sample = runs.sample()
+    if correction is not None:
+        sample = correction.runs(sample)
+    check_learning_from(sensing_of(sample, None))
+    found = self_calibrated(sample, bayes, start)
+    taught = counted(sample.sizes["run"], "run")
+    tell(f"self-calibrated by {taught}, evenly spread; each run is judged by what they teach")
+    for line in found.lines:
+        tell(line)
+    return found.bayes
+
+
 def remember_many(
     stored: RobotRecord, folder: Path, reading: LogOptions, recorded: datetime | None
 ) -> str:
@@ -59,7 +88,7 @@ def remember_many(
     log = log_file(reading.logs[0], recorded)
     added, known, rest = 0, 0, read_diagnoses(folder)
     while some := list(islice(rest, PIECE)):
-        done = stored.remember(some, log)
+        done = stored.remember(some, log, first=added + known)
         added, known = added + done.added, known + done.known
     before = f", {known} known before" if known else ""
     return f"remembered in {stored.store.name}: {counted(added, 'run')} of {stored.name}{before}"

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+import time
 import tomllib
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -13,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from failuretwin.app.records import episode_line
 from failuretwin.app.terminal import tell
 from failuretwin.connection.calibration.result import Calibration, calibration_text
-from failuretwin.core.errors import InputError, counted
+from failuretwin.core.errors import InputError, OutputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import concatenate
 from failuretwin.data_knowledge.records.episodes import RAISED
@@ -21,7 +25,7 @@ from failuretwin.data_knowledge.records.history import FaultEpisode, StoredCalib
 from failuretwin.data_knowledge.records.log_files import LogFile, log_file
 from failuretwin.data_knowledge.records.offsets import MotorOffset
 from failuretwin.data_knowledge.records.rows import Basis
-from failuretwin.data_knowledge.records.sessions import Note
+from failuretwin.data_knowledge.records.sessions import Note, Session
 from failuretwin.data_knowledge.records.store import Remembered, Store
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, calibration_from_table
 from failuretwin.digital_model.robot import Robot
@@ -34,6 +38,10 @@ if TYPE_CHECKING:
     from failuretwin.data_knowledge.workers import Workforce
     from failuretwin.decision.acting.session import AlarmChange
     from failuretwin.decision.test_motions.health_check import CheckResult
+
+
+RETRY_S = 5.0
+"""Time after which entries are tried again on a store that failed [s]."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +116,9 @@ class RobotRecord:
         runs: xr.Dataset | None = None,
         command: str = "diagnose",
         offsets: Sequence[MotorOffset] = (),
+        first: int = 0,
     ) -> Remembered:
-        """Store the diagnoses of one log."""
+        """Store diagnoses of one log, from its run number `first` on."""
         return self.store.remember(
             diagnoses,
             self.name,
@@ -119,6 +128,7 @@ class RobotRecord:
             calibration=self.calibration_number,
             command=command,
             offsets=offsets,
+            first=first,
         )
 
     def tracked_rows(self) -> tuple[dict[str, Any], ...]:
@@ -156,30 +166,11 @@ class RobotRecord:
         """Return what keeps the diagnoses of some logs."""
         return DiagnosisKeeper(self, reading, recorded)
 
-    def remember_work(
-        self,
-        command: str,
-        known: CalibratedRobot,
-        method: str,
-        entries: Sequence[tuple[datetime, str | AlarmChange]],
-    ) -> list[str]:
-        """Store what a command did with the arm, and why; return what was stored, in lines."""
+    def work_keeper(self, command: str, known: CalibratedRobot, method: str) -> WorkKeeper:
+        """Return what keeps what a command does with the arm, and why."""
         figures = known.imperfections
         method = f"{method}; healthy behaviour: {figures.name}"
-        basis = Basis(command, self.calibration_number, method, figures.protocol)
-        notes = [_note(at, entry) for at, entry in entries]
-        log = LogFile(command, None, 0, datetime.now(UTC))
-        diagnosed = any(one.diagnosis is not None for one in notes)
-        session = self.store.begin(
-            self.name,
-            basis,
-            *notes,
-            log=log if diagnosed else None,
-            runs=[command],
-            profile=self.profile,
-        )
-        first = f"remembered in {self.store.name}: {command} of {self.name}"
-        return [first, *map(episode_line, session.changed)]
+        return WorkKeeper(self, Basis(command, self.calibration_number, method, figures.protocol))
 
     def remember_check(
         self, results: Sequence[CheckResult], log: LogFile | None = None
@@ -232,6 +223,64 @@ class RobotRecord:
         )
         where = f"remembered in {self.store.name}"
         return f"{where}: calibration {kept.name} of {self.name}, in force from now on"
+
+
+class WorkKeeper:
+    """Stores the entries of a diary while the arm works, in a thread: the arm never waits for it.
+
+    Entries wait where the store fails, and are tried again.
+
+    Args:
+        record: The robot in the store.
+        basis: The command, and what its results rest on.
+    """
+
+    def __init__(self, record: RobotRecord, basis: Basis) -> None:
+        self._record = record
+        self._basis = basis
+        self._session: Session | None = None
+        self._waiting: list[Note] = []
+        self._changed: dict[int, FaultEpisode] = {}
+        self._due_s = -math.inf
+        self._writer = ThreadPoolExecutor(1)
+
+    def keep(self, at: datetime, entry: str | AlarmChange) -> None:
+        """Store an entry of a time (UTC), soon."""
+        self._writer.submit(self._try, _note(at, entry))
+
+    def end(self) -> list[str]:
+        """Store what waits, and return what was stored, in lines.
+
+        Raises:
+            OutputError: If it cannot be stored.
+        """
+        self._writer.shutdown()
+        self._write()
+        command = self._basis.command
+        first = f"remembered in {self._record.store.name}: {command} of {self._record.name}"
+        return [first, *map(episode_line, self._changed.values())]
+
+    def _try(self, note: Note) -> None:
+        self._waiting.append(note)
+        if time.monotonic() >= self._due_s:
+            self._due_s = time.monotonic() + RETRY_S
+            with suppress(OutputError):
+                self._write()
+                self._due_s = -math.inf
+
+    def _write(self) -> None:
+        if self._session is None:
+            self._session = self._begun()
+        changed = self._session.note(*self._waiting)
+        self._waiting = []
+        self._changed |= {one.number: one for one in changed}
+
+    def _begun(self) -> Session:
+        record, command = self._record, self._basis.command
+        log = LogFile(command, None, 0, datetime.now(UTC))
+        return record.store.begin(
+            record.name, self._basis, log=log, runs=[command], profile=record.profile
+        )
 
 
 def _note(at: datetime, entry: str | AlarmChange) -> Note:

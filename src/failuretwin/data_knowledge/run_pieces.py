@@ -91,24 +91,32 @@ class RunPieces:
         piece = self.pieces[number]
         return self._read(piece, range(piece.size))
 
-    def sample(self) -> xr.Dataset:
-        """Return runs that are evenly spread over all, `PIECE` at most.
+    @property
+    def size(self) -> int:
+        """Number of runs of run sets and of other logs."""
+        return sum(piece.size for piece in self.pieces)
+
+    def sample(self, most: int | None = None) -> xr.Dataset:
+        """Return runs that are evenly spread over all.
 
         Of logs, whole ones are read, evenly spread, and then evenly spread runs are kept.
+
+        Args:
+            most: Largest number of runs; None: `PIECE`.
 
         Raises:
             InputError: If they cannot be read.
         """
         sizes = np.array([piece.size for piece in self.pieces])
         first = np.concatenate([[0], np.cumsum(sizes)])
-        chosen = _spread(int(first[-1]))
+        chosen = _spread(int(first[-1]), most or PIECE)
         parts = []
         for number, piece in enumerate(self.pieces):
             here = chosen[(chosen >= first[number]) & (chosen < first[number + 1])]
             if len(here):
                 parts.append(self._read(piece, (here - first[number]).tolist()))
         runs = concatenate(parts)
-        return runs.isel(run=_spread(runs.sizes["run"]))
+        return runs.isel(run=_spread(runs.sizes["run"], most or PIECE))
 
     def _read(self, piece: Piece, items: Sequence[int]) -> xr.Dataset:
         """Return some runs of a run set, or the runs of some logs of a piece."""
@@ -141,8 +149,8 @@ def _is_run_set(log: Log) -> bool:
     return log.is_run_set
 
 
-def _spread(count: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    return np.unique(np.linspace(0, count - 1, min(count, PIECE)).astype(np.int64))
+def _spread(count: int, most: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
 def _rows(log: Log) -> list[range]:

@@ -29,12 +29,13 @@ from failuretwin.decision.results import (
     write_part,
 )
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.explanation import with_reading_doubt
+from failuretwin.inference.explanation import with_learned_method, with_reading_doubt
 from failuretwin.inference.observation.computed_tool import is_computed
 from failuretwin.inference.prepared import PreparedDiagnoser, parts_of
 from failuretwin.inference.set_ups.log_correction import LogCorrection
 
-MANIFEST = "manifest.json"
+MANIFEST = "_manifest.json"
+"""Pandas and the like skip such a name where they open the folder as one table."""
 PACKAGES = ("numpy", "scipy", "xarray", "zarr", "pyarrow")
 """Packages whose versions may change bytes of the results."""
 
@@ -196,6 +197,8 @@ class UnfinishedResults(Unfinished):
         ]
         if computed:
             found = [with_reading_doubt(one, one.diagnosis or "") for one in found]
+        if self.bayes.priors.fault_factors:
+            found = [with_learned_method(one) for one in found]
         write_part(found, [str(h) for h in self.bayes.hypothesis_set], *self.files(piece))
         return self.mark(piece)
 

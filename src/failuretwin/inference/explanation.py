@@ -235,6 +235,13 @@ def _evidence_lines(
 
 
 STUCK = "stuck"
+LEARNED_METHOD = "learned priors"
+"""What the method of a diagnosis says of priors that a store has taught."""
+
+
+def with_learned_method(diagnosis: Diagnosis) -> Diagnosis:
+    """Return a diagnosis whose method says that its priors were learned."""
+    return replace(diagnosis, method=f"{diagnosis.method}; {LEARNED_METHOD}")
 
 
 def with_reading_doubt(diagnosis: Diagnosis, cause: str) -> Diagnosis:

@@ -71,7 +71,7 @@ def act(
     limits, speed, floor, the arm's own links. Stop with Ctrl-C, or `failuretwin stop`.
     """
     from failuretwin.app.arms import commander_of, is_moved, spared_of
-    from failuretwin.app.diary import noting, target_line
+    from failuretwin.app.diary import noting
     from failuretwin.app.reports.acting_report import result_parts
     from failuretwin.decision.acting.session import Acting
     from failuretwin.decision.acting.task import ActingSettings, read_task
@@ -87,7 +87,6 @@ def act(
         if is_moved(arm):
             with noting(stored, "act", known, strategy) as say:
                 results = acting.work(wanted, commander, say, say.note)
-                say.note(*map(target_line, results))
         else:
             tell("nothing moves without --move; this is what would be ordered")
             results = acting.dry_run(wanted, first_standing(commander), tell)

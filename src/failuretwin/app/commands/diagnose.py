@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +13,6 @@ import failuretwin as ft
 from failuretwin.app.commands import options as opt
 from failuretwin.app.commands.store import (
     LEARNED,
-    LEARNED_METHOD,
     StoreOptions,
     learned_priors_option,
     recorded_option,
@@ -24,6 +22,7 @@ from failuretwin.app.terminal import show, tell
 from failuretwin.core.errors import InputError
 
 if TYPE_CHECKING:
+    from failuretwin.app.learning import Start
     from failuretwin.app.remembering import RobotRecord
     from failuretwin.data_knowledge.workers import Workforce
     from failuretwin.inference.together.fault_course import FaultCourse
@@ -36,7 +35,7 @@ BAYES_ONLY = (
 LEARNING = ("out", "independent")
 """Options that only learning from several runs has."""
 WHOLE = (
-    *("method", "track", "self_calibrate", "out", "independent", "learned_priors"),
+    *("method", "track", "independent"),
     *("json_file", "csv_file", "report", "correct"),
 )
 """Options that need all runs in memory."""
@@ -171,15 +170,16 @@ def diagnose(
         priors=priors_of(known.robot, sse_range, onset, error_range),
         sensing=sensing,
     )
-    if parquet is not None:
-        _diagnose_many(reading, bayes, parquet, force.workforce, stored, recorded)
-        return
-    keeper = None if stored is None else stored.keeper(reading, recorded)
+    _refuse_unused(method == given.BAYES, track, self_calibrate, parquet is not None)
     if learned_priors:
         bayes = memory.needed(stored, LEARNED).with_learned_priors(bayes)
-    _refuse_unused(method == given.BAYES, track, self_calibrate)
-    diagnoser = given.chosen_diagnoser(method, bayes)
     start = learning.Start(robot.calibration, out, stored)
+    if parquet is not None:
+        many = (reading, bayes, parquet, force.workforce, stored, recorded)
+        _diagnose_many(*many, start if self_calibrate else None)
+        return
+    keeper = None if stored is None else stored.keeper(reading, recorded)
+    diagnoser = given.chosen_diagnoser(method, bayes)
     tracking = learning.Tracking(bayes, start) if track else None
     runs = (reading if keeper is None else keeper).runs(known.robot, force.workforce)
     sensed = sensing_of(runs, sensing)
@@ -187,8 +187,7 @@ def diagnose(
     if together:
         learning.check_learning_from(sensed)
     found = learning.found_in(runs, bayes, diagnoser, tracking, start if self_calibrate else None)
-    diagnoses = given.with_doubts(found.diagnoses, runs, known.twin)
-    diagnoses = _by_learned_priors(diagnoses) if learned_priors else diagnoses
+    diagnoses = given.with_doubts(found.diagnoses, runs, known.twin, learned_priors)
     if (sse_range or error_range) and diagnoser is bayes:
         usual = priors_of(known.robot, None, onset)
         tell(learning.ruled_out_note(runs, found.bayes, diagnoses, usual), err=True)
@@ -218,24 +217,22 @@ def _diagnose_many(
     workforce: Workforce,
     stored: RobotRecord | None,
     recorded: datetime | None,
+    start: Start | None,
 ) -> None:
-    """Diagnose runs of any number into parquet files, and store the diagnoses if asked to."""
+    """Diagnose runs of any number into parquet files, and store the diagnoses if asked to.
+
+    A calibration is learned from a sample of them first, if there is a `start`.
+    """
     from failuretwin.app.many_runs import diagnose_many, remember_many
 
-    opt.refuse_unused("--parquet holds a piece of the runs in memory, not all", *WHOLE)
     if stored is not None and len(reading.logs) > 1:
         raise InputError(
             f"--parquet and --store take one LOG, got {len(reading.logs)}. Diagnose one after the "
             "other."
         )
-    show(*diagnose_many(reading, bayes, parquet, workforce))
+    show(*diagnose_many(reading, bayes, parquet, workforce, start))
     if stored is not None:
         tell(remember_many(stored, parquet, reading, recorded))
-
-
-def _by_learned_priors(diagnoses: Sequence[ft.Diagnosis]) -> list[ft.Diagnosis]:
-    """Return diagnoses whose method says that their priors were learned."""
-    return [replace(one, method=f"{one.method}; {LEARNED_METHOD}") for one in diagnoses]
 
 
 def _write(
@@ -253,8 +250,10 @@ def _write(
         write_csv(diagnoses, csv_file, course)
 
 
-def _refuse_unused(bayes: bool, track: bool, self_calibrate: bool) -> None:
+def _refuse_unused(bayes: bool, track: bool, self_calibrate: bool, parquet: bool) -> None:
     """Raise InputError if options contradict each other or have no effect."""
+    if parquet:
+        opt.refuse_unused("--parquet holds a piece of the runs in memory, not all", *WHOLE)
     if track and self_calibrate:
         raise InputError(
             "--track judges each run by those before it, --self-calibrate by all. Choose one."

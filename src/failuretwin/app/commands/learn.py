@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+MOST_RUNS = 1000
+"""Runs that `calibrate` learns from: more would narrow no figure by much, and fill the memory."""
+
+
 @click.command()
 @opt.file_option("--out", "FILE", "Calibration to write (.toml).", required=True)
 @click.option(
@@ -49,9 +53,11 @@ def calibrate(
     """Learn from healthy logs where the motors settle, how they lag and what goes wrong by chance.
 
     LOG is any input of `diagnose`. Motor readings are used where the logs have them, else the tool
-    path alone. Runs that are labelled or look faulty are left out. Step tests (CSV files, or
+    path alone. Runs that are labelled or look faulty are left out. Of more than 1000 runs, so many
+    evenly spread ones are used. Step tests (CSV files, or
     folders that hold some) add servo loops and speed limits.
     """
+    from failuretwin.app.inputs import read_some
     from failuretwin.app.reports.calibration_report import (
         calibration_parts,
         write_calibration_page,
@@ -71,7 +77,7 @@ def calibrate(
     tests, others = step_parameters.split_step_tests(reading.logs, reading.columns)
     steps = step_parameters.learn_loops(tests, robot.model)
     model = steps.robot
-    runs = replace(reading, logs=tuple(others)).runs(model)
+    runs = read_some(others, model, reading.options, reading.columns, MOST_RUNS)
     source = ", ".join(map(str, reading.logs))
     wrong = _wrong_set_up(runs, model)
     try:

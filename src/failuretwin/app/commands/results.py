@@ -12,7 +12,6 @@ import failuretwin as ft
 from failuretwin.app.commands import options as opt
 from failuretwin.app.commands.store import (
     LEARNED,
-    LEARNED_METHOD,
     StoreOptions,
     learned_priors_option,
     store_options,
@@ -174,10 +173,11 @@ def _results_report(
 
 def _posterior(diagnosis: ft.Diagnosis | Record, stored: RobotRecord | None) -> Mapping[str, float]:
     """Return the posterior of a diagnosis, by the learned priors of a store if there is one."""
+    from failuretwin.connection.fault_rates import reweighted
+    from failuretwin.inference.explanation import LEARNED_METHOD
+
     if stored is None or LEARNED_METHOD in diagnosis.method:
         return diagnosis.posterior
-    from failuretwin.connection.fault_rates import reweighted
-
     hypotheses = [Hypothesis.parse(name) for name in diagnosis.posterior]
     return reweighted(diagnosis.posterior, stored.fault_factors(hypotheses))
 

@@ -87,8 +87,7 @@ store_options = opt.gathered(
         help="With --store: name of this very robot. Default: the name of its profile.",
     ),
 )
-LEARNED, LEARNED_METHOD = "--learned-priors", "learned priors"
-"""The option, and what the method of a diagnosis says of it."""
+LEARNED = "--learned-priors"
 learned_priors_option = opt.flag_option(
     LEARNED,
     "With --store: faults that people confirmed at robots of this kind count more, others less, "

@@ -258,7 +258,7 @@ def read_history(connection: sa.Connection, row: int, robot: str) -> History:
     return History(
         robot,
         _kind(connection, row),
-        _counts(connection, row),
+        read_counts(connection, row),
         _recent(connection, row),
         _notes(connection, row),
         read_episodes(connection, row),
@@ -273,16 +273,10 @@ def _kind(connection: sa.Connection, row: int) -> str:
     return connection.scalar(newest.order_by(profiles.c.id.desc()).limit(1)) or ""
 
 
-def _counts(connection: sa.Connection, row: int) -> dict[str, int]:
-    """Return the number of diagnoses by state, without those behind notes."""
-    query = sa.select(diagnoses.c.state, sa.func.count()).group_by(diagnoses.c.state)
-    every = query.where(diagnoses.c.robot_id == row)
-    noted = query.join(notes, notes.c.diagnosis_id == diagnoses.c.id).where(notes.c.robot_id == row)
-    less = {str(state): int(count) for state, count in connection.execute(noted)}
-    found = {
-        str(state): int(count) - less.get(state, 0) for state, count in connection.execute(every)
-    }
-    return {state: count for state, count in found.items() if count}
+def read_counts(connection: sa.Connection, row: int) -> dict[str, int]:
+    """Return the number of diagnoses of a robot by state, without those behind notes."""
+    last = sa.select(sessions.c.diagnosed).where(sessions.c.robot_id == row)
+    return connection.scalar(last.order_by(sessions.c.id.desc()).limit(1)) or {}
 
 
 def _recent(connection: sa.Connection, row: int) -> tuple[StoredDiagnosis, ...]:

@@ -132,8 +132,13 @@ sessions = sa.Table(
     _needed("method", Text),
     _needed("protocol", Text),
     sa.Column("command", Text, nullable=False, server_default="diagnose"),
+    sa.Column("diagnosed", Json, nullable=False, server_default="{}"),
+    sa.Index("ix_sessions_robot", "robot_id", "id"),
 )
-"""What a command did with a robot: version of the package, method, calibration it rests on."""
+"""What a command did with a robot: version of the package, method, calibration it rests on.
+
+`diagnosed` counts by state all diagnoses of the robot, this session's included, without those
+behind notes: a history need not count them."""
 
 logs = sa.Table(
     "logs",
@@ -185,7 +190,6 @@ diagnoses = sa.Table(
     _needed("quality", Json),
     _needed("digest", Text),
     sa.Index("ix_diagnoses_robot", "robot_id", "at"),
-    sa.Index("ix_diagnoses_state", "robot_id", "state"),
 )
 """Diagnoses of runs; intervals hold 90 %, `magnitude` is in the unit of its fault mode."""
 

@@ -96,6 +96,7 @@ class Store(StoreReader):
         calibration: int | None = None,
         command: str = "diagnose",
         offsets: Sequence[MotorOffset] = (),
+        first: int = 0,
     ) -> Remembered:
         """Store the diagnoses of the runs of one log, in the order of the log.
 
@@ -105,7 +106,7 @@ class Store(StoreReader):
         run is stored once.
 
         Args:
-            diagnoses: Diagnoses of all runs of the log.
+            diagnoses: Diagnoses of all runs of the log, or of successive ones.
             robot: Name of the robot, made if it is new.
             log: The log, by path and checksum; None: no file, recorded now.
             runs: The run set, for the duration [s] and the sensor rate [Hz].
@@ -114,6 +115,7 @@ class Store(StoreReader):
                 the store.
             command: The command that made them.
             offsets: Offsets of the motors that it measured.
+            first: Number of the first of these runs in the log.
 
         Raises:
             InputError: If the log cannot be read or the name of the robot cannot be shown.
@@ -127,7 +129,7 @@ class Store(StoreReader):
             row = writing.keep_robot(connection, robot, profile)
             at = writing.keep_log(connection, row, source)
             names = [one.run for one in diagnoses]
-            run_rows = writing.keep_runs(connection, at, names, details)
+            run_rows = writing.keep_runs(connection, at, names, details, first)
             kept, seen = writing.new_diagnoses(connection, at, diagnoses, run_rows, calibration)
             if not kept:
                 return Remembered(0, len(diagnoses), ())
@@ -137,7 +139,8 @@ class Store(StoreReader):
                     if run not in seen:
                         tracker.follow(diagnosis, source.recorded, number)
             basis = Basis(command, calibration, diagnoses[0].method, diagnoses[0].protocol)
-            of = SessionRows(writing.add_session(connection, row, basis), row)
+            states = (one.state for one, _, _ in kept)
+            of = SessionRows(writing.add_session(connection, row, basis, states), row)
             rows = writing.add_diagnoses(connection, of, kept, source.recorded)
             add_offsets(connection, of, source.recorded, offsets)
             changed = writing.keep_episodes(connection, row, tracker.changed, rows)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -22,7 +23,7 @@ from failuretwin.data_knowledge.records.episodes import (
     EpisodeTracker,
     NamedFault,
 )
-from failuretwin.data_knowledge.records.history import read_episodes
+from failuretwin.data_knowledge.records.history import read_counts, read_episodes
 from failuretwin.data_knowledge.records.log_files import LogFile
 from failuretwin.data_knowledge.records.rows import Basis, SessionRows, add_rows
 from failuretwin.data_knowledge.records.schema import (
@@ -150,15 +151,20 @@ def keep_log(connection: sa.Connection, robot: int, log: LogFile) -> StoredLog:
 
 
 def keep_runs(
-    connection: sa.Connection, log: StoredLog, names: Sequence[str], details: Sequence[Any]
+    connection: sa.Connection,
+    log: StoredLog,
+    names: Sequence[str],
+    details: Sequence[Any],
+    first: int = 0,
 ) -> list[int]:
-    """Return the rows of the runs of a log, in its order."""
+    """Return the rows of the runs of a log, in its order, from number `first` on."""
     query = sa.select(runs.c.position, runs.c.name, runs.c.id).where(runs.c.log_id == log.row)
+    query = query.where(runs.c.position.between(first, first + len(names) - 1))
     stored = [] if log.new else connection.execute(query).all()
     known = {(one.position, one.name): one.id for one in stored}
-    wanted = list(enumerate(map(storable, names)))
+    wanted = list(enumerate(map(storable, names), first))
     rows = [
-        {"log_id": log.row, "position": k, "name": name, "details": details[k]}
+        {"log_id": log.row, "position": k, "name": name, "details": details[k - first]}
         for k, name in wanted
         if (k, name) not in known
     ]
@@ -170,11 +176,21 @@ def keep_runs(
 # Sessions.
 
 
-def add_session(connection: sa.Connection, robot: int, basis: Basis) -> int:
-    """Return the row of a new session."""
+def add_session(
+    connection: sa.Connection, robot: int, basis: Basis, states: Iterable[str] = ()
+) -> int:
+    """Return the row of a new session, of a robot that other writers are kept from.
+
+    Args:
+        connection: Connection to the store.
+        robot: Row of the robot.
+        basis: What the session rests on.
+        states: States of the diagnoses of runs that it adds.
+    """
+    diagnosed = Counter(read_counts(connection, robot)) + Counter(states)
     stated: dict[str, Any] = {"robot_id": robot, "calibration_id": basis.calibration}
     stated |= {"begun": datetime.now(UTC), "version": __version__, "command": basis.command}
-    stated |= {"method": basis.method, "protocol": basis.protocol}
+    stated |= {"method": basis.method, "protocol": basis.protocol, "diagnosed": diagnosed}
     return add_rows(connection, sessions, [stated])[0]
 
 
@@ -192,7 +208,7 @@ def new_diagnoses(
     calibration: int | None,
 ) -> tuple[Kept, set[int]]:
     """Return the diagnoses that are not stored yet, and the runs that have one already."""
-    known = set() if log.new else _stored_digests(connection, log.row)
+    known = set() if log.new else _stored_digests(connection, run_rows)
     each = [
         (one, row, _digest_of(one, calibration))
         for one, row in zip(diagnoses, run_rows, strict=True)
@@ -234,9 +250,10 @@ def _digest_of(diagnosis: Diagnosis, calibration: int | None) -> str:
     return text_checksum(json.dumps(record, sort_keys=True))
 
 
-def _stored_digests(connection: sa.Connection, log: int) -> set[tuple[int, str]]:
-    """Return run and digest of all diagnoses of a log."""
-    query = sa.select(diagnoses.c.run_id, diagnoses.c.digest).join(runs).where(runs.c.log_id == log)
+def _stored_digests(connection: sa.Connection, run_rows: Sequence[int]) -> set[tuple[int, str]]:
+    """Return run and digest of all diagnoses of some runs of one log."""
+    query = sa.select(diagnoses.c.run_id, diagnoses.c.digest)
+    query = query.where(diagnoses.c.run_id.between(min(run_rows), max(run_rows)))
     return {(one.run_id, one.digest) for one in connection.execute(query)}
 
 

@@ -152,17 +152,29 @@ class Acting:
         task: Task,
         commander: Commander,
         tell: Callable[[str], None],
-        report: Callable[[AlarmChange], None] = lambda change: None,
+        report: Callable[[AlarmChange | TargetResult], None] = lambda happened: None,
     ) -> Sequence[TargetResult]:
         """Carry a task out on an arm and return what became of each target.
 
-        `report` is called with each change of the alarm.
+        `report` is called with each change of the alarm, and with what became of each target.
         """
         standing = first_standing(commander)
         actor, alarm = self.actor(task, standing, tell), FaultAlarm(report)
         work = Work(actor, self.gate, commander, standing)
-        work.seen = lambda: alarm.see(actor.belief, actor.judgement)
+        reported = list[TargetResult]()
+
+        def seen() -> None:
+            alarm.see(actor.belief, actor.judgement)
+            report_results()
+
+        def report_results() -> None:
+            for result in actor.results[len(reported) :]:
+                reported.append(result)
+                report(result)
+
+        work.seen = seen
         work.carry_out()
+        report_results()
         alarm.end()
         for line in self.planner.sparing_lines(actor.ways):
             tell(line)
