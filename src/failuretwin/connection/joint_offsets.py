@@ -87,12 +87,8 @@ class _Stops(NamedTuple):
 def joint_offsets(runs: xr.Dataset, robot: Robot, known: Imperfections) -> tuple[JointOffset, ...]:
     """Return the offset of each joint that follows its commands and stops often enough.
 
-    A stuck motor does not follow, so it has none.
-
-    Args:
-        runs: Runs with `command` and `position`, of one robot.
-        robot: The robot.
-        known: Its healthy behaviour; without settled errors or their variation, its class counts.
+    A stuck motor does not follow, so it has none. Runs have `command` and `position`. Where the
+    known healthy behaviour lacks settled errors or their variation, the arm's class counts.
     """
     if known.settling is None or known.variation is None or not known.variation.bias:
         known = generic_imperfections(robot)

@@ -56,10 +56,7 @@ def history_path(calibration: Path) -> Path:
 def open_history(calibration: Path, start: LifeFilter, cold: bool) -> History:
     """Return the history beside a calibration; where there is none, it begins with `start`.
 
-    Args:
-        calibration: The file beside which it is kept.
-        start: What is believed before any run.
-        cold: Whether that is what its kind is like.
+    That is what is believed before any run; `cold`: what the robot's kind is like.
 
     Raises:
         InputError: If the history cannot be read, is damaged, or has begun with something else.
@@ -85,11 +82,7 @@ def open_history(calibration: Path, start: LifeFilter, cold: bool) -> History:
 
 
 def read_rows(path: Path, robot: str) -> list[dict[str, Any]]:
-    """Return the lines of a history, one a run, as `keep_history` was given them.
-
-    Args:
-        path: CAL.history.jsonl.
-        robot: Name of the robot that it must be of.
+    """Return the lines of a robot's history, one a run, as `keep_history` was given them.
 
     Raises:
         InputError: If it cannot be read, is damaged, is of another robot, or holds no run.

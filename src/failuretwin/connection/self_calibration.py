@@ -223,11 +223,7 @@ def with_timing_of(
 ) -> Imperfections:
     """Return imperfections with the late starts and the schedule that commands tell.
 
-    Args:
-        known: What is believed of the robot otherwise.
-        movements: Movements as they were commanded.
-        robot: The robot.
-        runs: Their runs, which tell when readings stop before a late start; None: not known.
+    The runs tell when readings stop before a late start.
     """
     late = lateness(movements)
     gaps = np.zeros(0) if runs is None else gap_starts(runs, movements, late.late)
@@ -243,14 +239,7 @@ def more_when_late(entry: LostCommand) -> LostCommand:
 def as_calibration(
     found: FolderPosterior, believed: Imperfections, robot: Robot, runs: xr.Dataset
 ) -> Calibration:
-    """Return what was learned as a calibration, which anybody may use.
-
-    Args:
-        found: What runs say together.
-        believed: What was believed before.
-        robot: The robot.
-        runs: The runs.
-    """
+    """Return what was learned as a calibration, which anybody may use."""
     learned = found.model.imperfections
     source = f"{counted(runs.sizes['run'], 'run')} without labels; {believed.name}"
     parameters = _parameters(found, believed, robot)

@@ -56,12 +56,9 @@ class StudentFit:
 
 
 def fit_student(residual: Residual, begin: FloatArray, dims: int) -> StudentFit:
-    """Return the unknowns fitted to rows.
+    """Return the unknowns fitted to rows, from `begin` (unknown,).
 
-    Args:
-        residual: The model.
-        begin: Unknowns to begin at, (unknown,).
-        dims: n, the dimensions in which residuals can differ; channels may be more.
+    `dims` is n, the dimensions in which residuals can differ; channels may be more.
     """
     x, scatter = begin, _Scatter(dims)
     sigma = scatter.sigma(residual(x), np.inf)

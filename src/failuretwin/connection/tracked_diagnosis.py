@@ -71,10 +71,7 @@ class Tracked:
 def begin(diagnoser: BayesDiagnoser, cold: bool, limits: WearLimits | None = None) -> LifeFilter:
     """Return what is believed of a robot before any run.
 
-    Args:
-        diagnoser: A diagnoser with its hypotheses; it uses the calibration, unless it is cold.
-        cold: Whether nothing is known of this robot but its kind.
-        limits: How fast and how far it may change; None: as usual.
+    That is its calibration, or, cold, what its kind is like.
 
     Raises:
         InputError: If it is not said where motors settle, or no hypothesis says where they do.
@@ -109,13 +106,9 @@ def diagnose_tracked(
     history: History,
     advance: Callable[[int], None] = lambda done: None,
 ) -> Tracked:
-    """Diagnose runs in their order, each by what those before it teach; writes nothing.
+    """Diagnose runs, oldest first, each by what those before it teach; writes nothing.
 
-    Args:
-        runs: The runs, oldest first.
-        diagnoser: How to diagnose.
-        history: What has been seen before.
-        advance: Called with the number of runs just diagnosed.
+    `advance` is called with the number of runs just diagnosed.
 
     Raises:
         InputError: If no run holds a movement, or they are of another robot.
@@ -269,12 +262,7 @@ class _Seen:
 
 
 def calibration_of(life: LifeFilter, runs: xr.Dataset) -> Calibration:
-    """Return what a life has taught as a calibration, which anybody may use.
-
-    Args:
-        life: What is believed of the robot.
-        runs: Its latest runs.
-    """
+    """Return what a life has taught by its latest runs, as a calibration that anybody may use."""
     robot, found = life.model.twin.robot, life.told
     told = as_calibration(found, life.begun, robot, runs)
     source = f"{life.arrived} runs without labels; {life.begun.name}"

@@ -244,12 +244,7 @@ def _draw(plan: Plan, run: int) -> _Draw:
 
 
 def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
-    """Simulate some of a plan's runs.
-
-    Args:
-        plan: Robot, faults, imperfections and seed of the runs.
-        runs: Numbers of the runs, each below `plan.size`.
-    """
+    """Simulate some of a plan's runs, by their numbers (each below `plan.size`)."""
     draws = [_draw(plan, run) for run in runs]
     chance = stack([draw.chance for draw in draws])
     commanded = delay_commands(stack_movements([draw.movements for draw in draws]), chance.late)

@@ -154,12 +154,7 @@ class UnfinishedRunSet(Unfinished):
         (self.store / GROUP).rename(self.folder / GROUP)
 
     def finish(self, content: str, path: Path) -> None:
-        """Make the store readable and put it in the place of `path`.
-
-        Args:
-            content: Hash of the runs.
-            path: Where the run set belongs; on an OSError it is as before.
-        """
+        """Make the store readable and put it in the place of `path`."""
         for torn in self.store.rglob("*.partial"):  # of a process that was killed as it wrote
             torn.unlink()
         manifest = {**_manifest(self.plan, self.chunk_runs), "content": content}

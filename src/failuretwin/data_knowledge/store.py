@@ -299,11 +299,7 @@ def sole_writer(path: Path, patience_s: float = 0.0) -> Iterator[None]:
     """Hold the lock `.NAME.lock` beside `path`; nobody else can write `path` meanwhile.
 
     The system lets go of the lock when its process dies, however that happens, so the file of a
-    dead process holds nobody back.
-
-    Args:
-        path: What is written.
-        patience_s: Time to wait for another writer [s].
+    dead process holds nobody back. `patience_s` is how long another writer is waited for [s].
 
     Raises:
         OutputError: If another process holds it, or if it cannot be made.

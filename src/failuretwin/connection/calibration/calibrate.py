@@ -77,13 +77,7 @@ whole, and logs are refused. Of ten healthy runs three look faulty in one sessio
 def exclude_suspect_runs(
     names: Sequence[str], sessions: Sequence[str], fault_probability: FloatArray
 ) -> list[LeftOut]:
-    """Return the runs that look faulty, and those of sessions that do.
-
-    Args:
-        names: Names of the runs.
-        sessions: The session of each run.
-        fault_probability: That of each run, (run,).
-    """
+    """Return the runs that look faulty, and those of sessions that do."""
     suspect, of = fault_probability >= SUSPECT, np.asarray(sessions)
     found = []
     for i, name in enumerate(names):

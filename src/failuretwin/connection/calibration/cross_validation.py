@@ -60,16 +60,10 @@ def cross_validate(part: SettlingFit, robot: Robot) -> tuple[HeldOut, ...]:
 def judge(
     observations: Observations, others: SettlingFit, robot: Robot, session: str
 ) -> HeldOut | None:
-    """Return how well a fit predicts settled movements that it has not seen.
+    """Return how well the fit to other sessions predicts the settled movements of a session.
 
     Movements whose commands did not arrive are left out: there is nothing to predict of them. None
     if fewer than two are left, for one movement says nothing of scatter.
-
-    Args:
-        observations: Settled movements of one session.
-        others: The fit to other sessions.
-        robot: The robot.
-        session: Name of the session.
     """
     settling = others.settling
     kind = HealthyModel.of(robot, generic_imperfections(robot))
@@ -111,10 +105,7 @@ def settled_errors(
 ) -> FloatArray:
     """Return settled minus expected: of motors [rad] or of the tool [m], a row a movement.
 
-    Args:
-        observations: Settled movements.
-        robot: The robot.
-        settling: Where its motors settle; None: exactly at their targets.
+    Without `settling` motors are expected exactly at their targets.
     """
     pose = expected_pose(observations, robot, settling)
     if observations.position is not None:
@@ -193,11 +184,6 @@ def predict(found: Calibration, runs: xr.Dataset, robot: Robot) -> Predictions:
 
     Where none were, each session is expected by a fit to the others; with one session alone, by
     the calibration itself.
-
-    Args:
-        found: The calibration.
-        runs: The runs it was learned from or judged on.
-        robot: The robot.
     """
     seen, settling = _observed(found, runs, robot), settling_of(found, robot)
     learned = np.array([name in found.sessions for name in seen.sessions])[seen.session]
@@ -303,11 +289,6 @@ def example_transient(
 
     It is taken from the longer half of the movements that began on time at a known place; None if
     there are none.
-
-    Args:
-        found: The calibration.
-        runs: The runs it was learned from or judged on.
-        robot: The robot.
     """
     runs = trusted_runs(found, runs)
     settling = settling_of(found, robot)

@@ -122,12 +122,9 @@ def session_names(runs: xr.Dataset) -> list[str]:
 
 
 def observe(runs: xr.Dataset, robot: Robot, *, use_readings: bool = True) -> Observations:
-    """Return where the movements of a run set settled.
+    """Return where movements settled, by the motors' own readings where the runs have them.
 
-    Args:
-        runs: Healthy runs.
-        robot: The robot.
-        use_readings: Whether to look at the motors' own readings, where the runs have them.
+    Without `use_readings`, by the tool alone.
     """
     of_motors = use_readings and "position" in runs
     model = uncalibrated(robot, of_motors, measured_rate(runs))
@@ -152,11 +149,7 @@ def uncalibrated(
 ) -> HealthyModel:
     """Return what is believed of a robot before its healthy logs: what arms of its class are like.
 
-    Args:
-        robot: The robot.
-        of_motors: Whether its motors are read, in whole counts where the profile has any.
-        rate_hz: Rate of the readings [Hz].
-        payload: Mass at the tool point [kg].
+    Motors that are read give whole counts where the profile has any. `payload` is in [kg].
     """
     kind = generic_imperfections(robot)
     assert kind.settling is not None

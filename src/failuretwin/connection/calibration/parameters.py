@@ -114,13 +114,8 @@ def loss_rates(
     """Return the rate of each single motor, and of each set that was seen to go together.
 
     Before any log the punctual rate is that of the arm's class, and the late one is the punctual.
-
-    Args:
-        observations: Settled movements.
-        lost: Motors that stayed, (movement, motor).
-        punctual: Movements that started on time, (run, movement).
-        delayed: Movements that started late, (run, movement); what is neither does not count.
-        robot: The arm.
+    `lost` are the motors that stayed, (movement, motor); movements (run, movement) that are neither
+    punctual nor delayed do not count.
     """
     at, names, kind = observations.at, robot.motor_names, class_of(robot)
     seen = {tuple(np.flatnonzero(row).tolist()) for row in lost if row.any()}
@@ -307,10 +302,7 @@ FEWEST = 6
 def timing_of(fit: TimingFit | None, late: Lateness, gaps: FloatArray) -> Timing:
     """Return how motions run late.
 
-    Args:
-        fit: Delay, lag and shortening; None: the logs do not say.
-        late: Late starts.
-        gaps: When readings stopped before them [s].
+    Without a fit the logs say nothing of delay, shortening and lag.
     """
     timing = Timing()
     if fit is not None:

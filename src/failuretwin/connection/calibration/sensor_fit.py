@@ -57,10 +57,6 @@ def fit_sensors(runs: xr.Dataset, model: HealthyModel) -> tuple[SensorFit, ...]:
     """Return what healthy runs say of every sensor whose readings they hold.
 
     Of the tool's position and of the motors' own readings nothing is learned here.
-
-    Args:
-        runs: Healthy runs.
-        model: Where the healthy robot settles.
     """
     told = (model.imperfections.sensors, model.twin.robot.profile.sensors)
     fits = []

@@ -92,12 +92,7 @@ class SortedMovements:
 
     @classmethod
     def of(cls, observations: Observations, model: HealthyModel) -> SortedMovements:
-        """Return what became of movements.
-
-        Args:
-            observations: Settled movements.
-            model: The robot, with the sensors of the observations; it is not in doubt.
-        """
+        """Return what became of movements; the robot, with their sensors, is not in doubt."""
         likelihood = RunLikelihood(observations.evidence, model.without_doubt)
         share = likelihood.outcome_probability[observations.at]
         sound = share.sum(axis=-1)
@@ -179,10 +174,7 @@ class SettlingFit:
         return self.sorted.log_likelihood + offsets
 
     def without(self, runs: BoolArray) -> SettlingFit:
-        """Return the fit to the other runs, found from here.
-
-        Args:
-            runs: The runs that it must not have seen, (run,).
+        """Return the fit without some runs (run,), found from here.
 
         Raises:
             InputError: If too few movements are left.
@@ -206,10 +198,7 @@ class SettlingFit:
 
 
 def fit_settling(observations: Observations) -> SettlingFit:
-    """Fit where the motors of a healthy robot settle.
-
-    Args:
-        observations: Settled movements of healthy runs, and what is believed of the robot.
+    """Fit where the motors of a healthy robot settle, by what is believed of it.
 
     Raises:
         InputError: If too few movements are left.
@@ -229,10 +218,6 @@ def fit_settling(observations: Observations) -> SettlingFit:
 
 def fitted_to(observations: Observations, together: RunsTogether) -> SettlingFit:
     """Return what is learned from runs, one pass after the other until nothing moves.
-
-    Args:
-        observations: The movements.
-        together: The same runs; they are learned from.
 
     Raises:
         InputError: If too few movements are left.

@@ -73,10 +73,7 @@ class Transients:
     def predicted(self, robot: Robot, values: FloatArray, lag: float) -> FloatArray:
         """Return the readings expected, (run, time, motor) [rad] or (run, time, axis) [m].
 
-        Args:
-            robot: The robot.
-            values: Delay [s] and shortening of each run, (run, 2).
-            lag: Lag of the robot [s].
+        `values` are delay [s] and shortening of each run, (run, 2); the lag is the robot's [s].
         """
         twin, (delay, shortening) = DigitalTwin(robot), values.T
         position = motion(self.movements, self.time, twin, delay, shortening, lag) + self.yielding
@@ -103,12 +100,7 @@ class TimingFit:
 
 
 def fit_timing(transients: Transients, robot: Robot) -> TimingFit | None:
-    """Fit the timing of a healthy robot; None if fewer than three runs show ramps.
-
-    Args:
-        transients: Readings on the ramps.
-        robot: The robot.
-    """
+    """Fit the timing of a healthy robot; None if fewer than three runs show ramps."""
     from scipy.optimize import minimize_scalar
 
     telling = np.flatnonzero(transients.used.sum(axis=1) >= 12)
@@ -216,13 +208,9 @@ def motion(
 ) -> FloatArray:
     """Return how motors without load make movements late and short, (run, time, motor) [rad].
 
-    Args:
-        movements: Movements between the angles at which the motors would settle without load.
-        time: Uniform grid, (time,) [s].
-        twin: The servo loops.
-        delay: Dead time of each run, (run,) [s].
-        shortening: Share by which the ramps of each run end early, (run,).
-        lag: Time constant of the lag on top of the servo loops [s].
+    Movements lead to the angles at which motors would settle without load, on a uniform grid
+    (time,) [s]. Delay [s] and shortening of the ramps are those of each run, (run,); the lag [s] is
+    on top of the servo loops.
     """
     moved = replace(
         movements,
@@ -317,16 +305,7 @@ def transients(
     settling: Settling,
     robot: Robot,
 ) -> Transients:
-    """Return the readings on ramps that began on time and at a known place.
-
-    Args:
-        runs: The runs of the observations.
-        movements: Their movements.
-        late: How late they started.
-        part: Sorted settled movements.
-        settling: Where motors settle.
-        robot: The robot.
-    """
+    """Return the readings on ramps that began on time and at a known place."""
     time = as_floats(runs["time"].values)
     used = _on_time(movements, late, part, time)
     of_motors = part.observations.of_motors

@@ -39,10 +39,7 @@ LONGEST_S = 600.0
 def motor_reading(time: float, angle: FloatArray, twin: DigitalTwin) -> Reading:
     """Return motor readings with the tool position computed from them, as in the published data.
 
-    Args:
-        time: Time by the robot's clock [s].
-        angle: (motor,) [rad], NaN where one is missing; then there is no tool position.
-        twin: Kinematics of the robot.
+    Angles are (motor,) [rad], NaN where one is missing; then there is no tool position.
     """
     if np.isfinite(angle).all():
         return Reading(time, twin.path(angle), angle)

@@ -307,12 +307,7 @@ class Fitted:
         return self.chain.position(self.start.sense * target + sag * torque)
 
     def geometry(self, noise_m: float, source: str) -> Geometry:
-        """Return it as a profile says it.
-
-        Args:
-            noise_m: What is left unexplained on each axis [m].
-            source: Where the figures come from.
-        """
+        """Return it as a profile says it; `noise_m` is left unexplained on each axis [m]."""
         joints = tuple(self._correction(j) for j in range(self.arm.motors))
         return Geometry(joints, self.scale, noise_m, source)
 
@@ -342,15 +337,7 @@ class Posterior:
 def fit(
     arm: Arm, start: Start, unknowns: Unknowns, poses: Poses, begin: FloatArray | None = None
 ) -> Posterior:
-    """Return an arm fitted to poses.
-
-    Args:
-        arm: The arm.
-        start: Senses, zeros and frame to start from.
-        unknowns: What is asked.
-        poses: Settled poses.
-        begin: Numbers to begin at, (unknown,); None: 0.
-    """
+    """Return an arm fitted to poses, from `start` and numbers `begin` (unknown,); None: 0."""
     spread, torque = unknowns.spread, arm.torque(poses.target, start)
 
     def residual(x: FloatArray) -> FloatArray:

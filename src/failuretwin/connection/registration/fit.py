@@ -89,12 +89,6 @@ def fit_registration(
 def register(poses: Poses, robot: Robot, source: str = "", date: str = "") -> Registration:
     """Fit frames, tool point, senses, zeros and geometry to settled poses.
 
-    Args:
-        poses: The poses.
-        robot: The robot.
-        source: Where they come from.
-        date: When it is done.
-
     Raises:
         InputError: As `fit_registration`.
     """

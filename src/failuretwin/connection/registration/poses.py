@@ -52,9 +52,7 @@ class Poses:
 def settled_poses(runs: xr.Dataset, robot: Robot) -> Poses:
     """Return the settled poses of healthy runs; runs that are labelled faulty are left out.
 
-    Args:
-        runs: The run set; nothing but commands and tool positions is read.
-        robot: The robot.
+    Nothing but commands and tool positions is read.
 
     Raises:
         InputError: If there are too few.

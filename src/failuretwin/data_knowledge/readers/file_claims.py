@@ -35,9 +35,7 @@ TEXT_CELL_BYTES = 64
 def check_netcdf(path: Path, most_runs: int | None = None) -> None:
     """Raise InputError unless the arrays of a NetCDF file can be meant and lie in it alone.
 
-    Args:
-        path: The file.
-        most_runs: The most runs that are in memory at a time; None: all.
+    `most_runs` are in memory at a time; None: all.
     """
     import h5py
 
@@ -81,9 +79,7 @@ MAY_BE_EMPTY = ("onset", "magnitude", "position", "temperature", "voltage")
 def check_zarr(path: Path, most_runs: int | None = None) -> None:
     """Raise InputError unless a Zarr store has only known codecs, sane sizes and all its chunks.
 
-    Args:
-        path: The store.
-        most_runs: The most runs that are in memory at a time; None: all.
+    `most_runs` are in memory at a time; None: all.
     """
     import zarr
 

@@ -69,12 +69,9 @@ class LeRobotEpisodes:
 
 
 def read_lerobot(path: Path, robot: Robot, angles: LeRobotAngles | None = None) -> LeRobotEpisodes:
-    """Read the episodes of a LeRobot data set, one log each.
+    """Read the episodes of a LeRobot data set, a folder, one log each.
 
-    Args:
-        path: Its folder.
-        robot: The robot it is of; channels of joints that it does not have are left out.
-        angles: What is known of the unit and sense of the numbers; None: nothing.
+    Channels of joints that the robot does not have are left out.
 
     Raises:
         InputError: If pyarrow is missing, or the data set cannot be read or lacks a joint.

@@ -126,12 +126,7 @@ def read_logs(
 ) -> xr.Dataset:
     """Return the runs of some logs as one run set.
 
-    Args:
-        logs: The logs, from `find_logs`.
-        robot: The robot that they are of.
-        options: How logs become runs.
-        workforce: Processes that read them, each log once; the runs do not depend on them.
-        on_progress: Called with the number of further logs that have been read.
+    `on_progress` is called with the number of further logs that have been read.
 
     Raises:
         InputError: If a log cannot be read.

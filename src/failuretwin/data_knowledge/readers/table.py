@@ -104,11 +104,7 @@ class Table:
         return part.to_numpy(dtype=np.float64)
 
     def numbers(self, columns: Sequence[str], *, gaps: bool = True) -> FloatArray:
-        """Return columns as numbers, (row, column); empty cells are NaN.
-
-        Args:
-            columns: Names of the columns.
-            gaps: Whether cells may be empty.
+        """Return columns as numbers, (row, column); NaN for empty cells, which only `gaps` allows.
 
         Raises:
             InputError: If a column is missing or a cell is no number.

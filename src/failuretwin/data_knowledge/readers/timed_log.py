@@ -220,11 +220,7 @@ def _check_times(time: FloatArray, name: str) -> None:
 def uniform_grid(stamps: FloatArray, length: float, step: float, where: str) -> FloatArray:
     """Return the time grid of a run, (time,) [s].
 
-    Args:
-        stamps: Times of its commands and readings, in any order [s].
-        length: Its end [s].
-        step: Step of the grid [s].
-        where: Its name, for the error text.
+    `stamps` are the times of its commands and readings, in any order [s].
 
     Raises:
         InputError: If the stamps hold a silence that no log can mean, or the grid has far more
