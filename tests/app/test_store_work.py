@@ -20,8 +20,8 @@ import failuretwin as ft
 from failuretwin.app.remembering import RobotRecord
 from failuretwin.app.shadow import Change, Snapshot
 from failuretwin.app.watch_keeper import begin_watch
-from failuretwin.connection.life_history import read_rows
 from failuretwin.connection.links.base import OK, Answer
+from failuretwin.connection.tracked_diagnosis import read_rows
 from failuretwin.core.hypothesis import ALL_CLEAR, RAISED, Alarm
 from failuretwin.data_knowledge.records.rows import Basis
 from failuretwin.data_knowledge.store import load_run_set, save_run_set

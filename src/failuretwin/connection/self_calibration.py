@@ -226,7 +226,7 @@ def with_timing_of(
     The runs tell when readings stop before a late start.
     """
     late = lateness(movements)
-    gaps = np.zeros(0) if runs is None else gap_starts(runs, movements, late.late)
+    gaps = np.zeros(0) if runs is None else gap_starts(runs, movements, late)
     schedule = schedule_of(movements, late, robot)
     return replace(known, timing=timing_of(None, late, gaps), schedule=schedule)
 

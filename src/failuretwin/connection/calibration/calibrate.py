@@ -49,6 +49,7 @@ from failuretwin.connection.calibration.timing_fit import (
     gap_starts,
     lateness,
     movements_of,
+    punctual,
     transients,
 )
 from failuretwin.core.errors import InputError
@@ -98,7 +99,6 @@ def fit_calibration(
     source: str,
     *,
     fault_probability: FloatArray | None = None,
-    use_readings: bool = True,
     judged: xr.Dataset | None = None,
     thorough: bool = True,
 ) -> Calibration:
@@ -111,7 +111,6 @@ def fit_calibration(
         source: Which logs they come from.
         fault_probability: That of each run, (run,); runs and sessions that look faulty are left
             out. None: all count.
-        use_readings: Whether to look at the motors' own readings, where the runs have them.
         judged: Healthy runs of sessions that only say how good the fit is; None: each session is
             left out once and judged by a fit to the others.
         thorough: Whether to check the fit on sessions that it has not seen, and the senses and
@@ -125,7 +124,7 @@ def fit_calibration(
     left_out = exclude_suspect_runs(names, session_names(runs), doubt)
     out = {entry.run for entry in left_out}
     kept = runs.isel(run=[i for i, run in enumerate(names) if run not in out])
-    part = fit_settling(observe(kept, robot, use_readings=use_readings))
+    part = fit_settling(observe(kept, robot))
     payload, remarks = 0.0, list[str]()
     if thorough:
         payload, told = best_payload(part, robot)
@@ -135,9 +134,9 @@ def fit_calibration(
             part = fit_settling(part.observations.of(model))
     movements = movements_of(kept)
     late = lateness(movements)
-    losses = loss_rates(part.observations, part.sorted.lost, late.punctual, late.delayed, robot)
+    losses = loss_rates(part.observations, part.sorted.lost, punctual(late), late > 0.0, robot)
     timing = fit_timing(transients(kept, movements, late, part, part.settling, robot), robot)
-    gaps = gap_starts(kept, movements, late.late)
+    gaps = gap_starts(kept, movements, late)
     glitches = glitch_rates(kept) if part.observations.of_motors else None
     imperfections = Imperfections(
         name=name,
@@ -176,10 +175,9 @@ def fit_calibration(
 
 
 def _held_out(part: SettlingFit, robot: Robot, judged: xr.Dataset | None) -> tuple[HeldOut, ...]:
-    seen = part.observations
     if judged is None:
         return cross_validate(part, robot)
-    unseen = observe(judged, robot, use_readings=seen.of_motors)
+    unseen = observe(judged, robot)
     entries = [
         judge(unseen[np.flatnonzero(unseen.session == index)], part, robot, name)
         for index, name in enumerate(unseen.sessions)

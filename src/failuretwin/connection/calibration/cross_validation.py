@@ -200,7 +200,7 @@ def predict(found: Calibration, runs: xr.Dataset, robot: Robot) -> Predictions:
 
 def _observed(found: Calibration, runs: xr.Dataset, robot: Robot) -> Observations:
     """Return the movements of trusted runs, of a robot with the payload of the calibration."""
-    seen = observe(trusted_runs(found, runs), robot, use_readings=found.used_readings)
+    seen = observe(trusted_runs(found, runs), robot)
     payload = settling_of(found, robot).payload
     return seen.of(uncalibrated(robot, seen.of_motors, payload=payload))
 

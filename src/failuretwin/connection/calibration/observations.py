@@ -121,12 +121,9 @@ def session_names(runs: xr.Dataset) -> list[str]:
     return [name.rpartition("/")[0] or name for name in names]
 
 
-def observe(runs: xr.Dataset, robot: Robot, *, use_readings: bool = True) -> Observations:
-    """Return where movements settled, by the motors' own readings where the runs have them.
-
-    Without `use_readings`, by the tool alone.
-    """
-    of_motors = use_readings and "position" in runs
+def observe(runs: xr.Dataset, robot: Robot) -> Observations:
+    """Return where movements settled, by the motors' own readings where the runs have them."""
+    of_motors = "position" in runs
     model = uncalibrated(robot, of_motors, measured_rate(runs))
     tool = evidence = Evidence(runs, model.settings).sound.settled
     if of_motors:

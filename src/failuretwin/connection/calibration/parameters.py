@@ -16,7 +16,7 @@ from failuretwin.connection.calibration.settling_fit import (
     DOF_PRIOR_SPREAD,
     SettlingPosterior,
 )
-from failuretwin.connection.calibration.timing_fit import BOUNDS, Lateness, TimingFit
+from failuretwin.connection.calibration.timing_fit import BOUNDS, TimingFit
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
@@ -299,7 +299,7 @@ FEWEST = 6
 """Values below which nothing is said of how they spread."""
 
 
-def timing_of(fit: TimingFit | None, late: Lateness, gaps: FloatArray) -> Timing:
+def timing_of(fit: TimingFit | None, late: FloatArray, gaps: FloatArray) -> Timing:
     """Return how motions run late.
 
     Without a fit the logs say nothing of delay, shortening and lag.
@@ -312,7 +312,7 @@ def timing_of(fit: TimingFit | None, late: Lateness, gaps: FloatArray) -> Timing
             ramp_shortening=spread_of(fit.shortening),
             lag_s=(fit.lag, fit.lag),
         )
-    starts = late_starts(late)
+    starts = late[late > 0.0]
     if len(starts) < FEWEST:
         return timing
     return replace(
@@ -323,14 +323,9 @@ def timing_of(fit: TimingFit | None, late: Lateness, gaps: FloatArray) -> Timing
     )
 
 
-def late_starts(late: Lateness) -> FloatArray:
-    """Return how late the late movements started, (late movement,) [s]."""
-    return late.late[late.delayed]
-
-
-def late_rate(late: Lateness) -> Rate:
+def late_rate(late: FloatArray) -> Rate:
     """Return the share of late movements; nothing before the first one of a run can stall."""
-    after_first = late.late[:, 1:]
+    after_first = late[:, 1:]
     known = after_first[np.isfinite(after_first)]
     return Rate(int(np.sum(known > 0.0)), len(known))
 
@@ -339,11 +334,11 @@ def _above_zero(values: Range) -> Range:
     return max(values[0], 0.0), max(values[1], 0.0)
 
 
-def schedule_of(movements: Movements, late: Lateness, robot: Robot) -> Schedule:
+def schedule_of(movements: Movements, late: FloatArray, robot: Robot) -> Schedule:
     """Return the schedule of the logs; runs of another length keep its pace."""
     first = movements.start[:, 0]
     spacing = np.diff(movements.start, axis=1)
-    punctual = spacing[np.nan_to_num(late.late[:, :-1], nan=1.0) == 0.0]
+    punctual = spacing[np.nan_to_num(late[:, :-1], nan=1.0) == 0.0]
     if len(punctual) == 0:
         return Schedule()
     whole = False
@@ -371,14 +366,13 @@ def readings_of(runs: xr.Dataset, robot: Robot, glitches: Sequence[Rate] | None)
     )
 
 
-def lateness_parameters(late: Lateness, gaps: FloatArray) -> list[Parameter]:
+def lateness_parameters(late: FloatArray, gaps: FloatArray) -> list[Parameter]:
     """Return the rate of late starts, how late they are, and when readings stop before them."""
-    if not late.known:
+    if np.isnan(late).all():
         note = "commands do not come at a steady pace; send them on a fixed schedule"
         return [Parameter("late starts", "", "share", 0.0, 0.0, 1.0, False, note)]
     found = [rate_parameter("late starts", "", late_rate(late))]
-    starts = late_starts(late)
-    for name, values in (("late start, median", starts), ("readings stop, median", gaps)):
+    for name, values in (("late start, median", late[late > 0.0]), ("readings stop, median", gaps)):
         if len(values) >= FEWEST:
             found.append(Parameter(name, "", "s", *median_interval(values)))
     return found

@@ -89,14 +89,12 @@ class TimingFit:
         shortening: Of each run that tells, (run,).
         lag: Lag of the robot [s].
         doubt: Half 95 % intervals of mean delay [s], mean shortening and lag [s].
-        residual: Typical residual left (1.48 MAD) [rad or m].
     """
 
     delay: FloatArray
     shortening: FloatArray
     lag: float
     doubt: tuple[float, float, float]
-    residual: float
 
 
 def fit_timing(transients: Transients, robot: Robot) -> TimingFit | None:
@@ -120,14 +118,8 @@ def fit_timing(transients: Transients, robot: Robot) -> TimingFit | None:
     middle = np.clip(lag, LAG_STEP_S, LONGEST_LAG_S - LAG_STEP_S)
     fits = [_fit_runs(ramps, robot, middle + k * LAG_STEP_S, found) for k in (-1.0, 0.0, 1.0)]
     values, costs = (np.stack(part) for part in zip(*fits, strict=True))
-    residual = np.abs(_residual(ramps, robot, found, lag)[ramps.used])
-    return TimingFit(
-        delay=found[:, 0],
-        shortening=found[:, 1],
-        lag=lag,
-        doubt=joint_doubt(values, costs, LAG_STEP_S, float(middle)),
-        residual=float(1.4826 * np.nanmedian(residual)),
-    )
+    doubt = joint_doubt(values, costs, LAG_STEP_S, float(middle))
+    return TimingFit(delay=found[:, 0], shortening=found[:, 1], lag=lag, doubt=doubt)
 
 
 def joint_doubt(
@@ -235,48 +227,31 @@ GAP_PERIODS = 4.0
 """A silence of this many periods of the readings is a gap."""
 
 
-@dataclass(frozen=True)
-class Lateness:
-    """Late starts of a stalled bus, read off the times between commands.
+def lateness(movements: Movements) -> FloatArray:
+    """Return how late each movement started, (run, movement) [s]; 0 punctual, NaN not known.
 
-    Attributes:
-        known: Whether commands come at a steady pace, so that lateness can be told.
-        late: How late each movement started, (run, movement) [s]; 0 punctual, NaN not known.
-        period: Usual time from command to command [s].
+    A late start of a stalled bus holds up the next command. Where commands come at no steady pace,
+    nothing is known.
     """
-
-    known: bool
-    late: FloatArray
-    period: float
-
-    @property
-    def delayed(self) -> BoolArray:
-        """Which movements surely started late, (run, movement)."""
-        return np.asarray(self.late > 0.0)
-
-    @property
-    def punctual(self) -> BoolArray:
-        """Which movements surely started on time, (run, movement).
-
-        The last one of a run holds up no other: it is taken for punctual only if all others were.
-        """
-        return np.asarray(self.late == 0.0) if self.delayed.any() else ~self.delayed
-
-
-def lateness(movements: Movements) -> Lateness:
-    """Return how late movements started: a late start holds up the next command."""
     spacing = np.diff(movements.start, axis=1)
     late = np.full(movements.start.shape, np.nan)
     seen = spacing[np.isfinite(spacing)]
     if len(seen) < 3:
-        return Lateness(False, late, float("nan"))
+        return late
     period = float(np.median(seen))
     spread = 1.4826 * float(np.median(np.abs(seen - period)))
-    if spread > STEADY_S:
-        return Lateness(False, late, period)
-    excess = spacing - period
-    late[:, :-1] = np.where(np.isfinite(excess), np.where(excess > LATE_S, excess, 0.0), np.nan)
-    return Lateness(True, late, period)
+    if spread <= STEADY_S:
+        excess = spacing - period
+        late[:, :-1] = np.where(np.isfinite(excess), np.where(excess > LATE_S, excess, 0.0), np.nan)
+    return late
+
+
+def punctual(late: FloatArray) -> BoolArray:
+    """Return which movements surely started on time by their lateness, (run, movement).
+
+    The last one of a run holds up no other: it is taken for punctual only if all others were.
+    """
+    return np.asarray(late == 0.0) if np.any(late > 0.0) else np.ones(late.shape, dtype=bool)
 
 
 def gap_starts(runs: xr.Dataset, movements: Movements, late: FloatArray) -> FloatArray:
@@ -300,7 +275,7 @@ def gap_starts(runs: xr.Dataset, movements: Movements, late: FloatArray) -> Floa
 def transients(
     runs: xr.Dataset,
     movements: Movements,
-    late: Lateness,
+    late: FloatArray,
     part: SettlingFit,
     settling: Settling,
     robot: Robot,
@@ -327,10 +302,10 @@ def transients(
 
 
 def _on_time(
-    movements: Movements, late: Lateness, part: SettlingFit, time: FloatArray
+    movements: Movements, late: FloatArray, part: SettlingFit, time: FloatArray
 ) -> BoolArray:
     """Return which times belong to a ramp that began on time at a known place, (run, time)."""
-    on_time = _sound(movements, part) & late.punctual
+    on_time = _sound(movements, part) & punctual(late)
     used = np.zeros((len(movements.start), len(time)), dtype=bool)
     for run, movement in np.argwhere(on_time):
         begin = movements.start[run, movement]

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from failuretwin import __version__
 from failuretwin.connection.links.base import Answer, CommandSent, Item, Sink
-from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosWriter
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosTopics, RosWriter
 from failuretwin.connection.links.ros_transport import Outgoing, RosCodec
 from failuretwin.core.errors import InputError, OutputError, needs_extra
 from failuretwin.data_knowledge.readers.bag_messages import GOAL_TOPIC, NS_PER_S

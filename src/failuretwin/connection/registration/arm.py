@@ -23,9 +23,8 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
-from failuretwin.connection.registration.poses import Poses
 from failuretwin.connection.student_fit import StudentFit, fit_student
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.geometry import (
     NO_OFFSET,
     Geometry,
@@ -61,6 +60,33 @@ LEAST_LOAD_NM = 1e-6
 
 ANGLES = ("roll", "pitch", "yaw")
 """What the turn of the base is told in; it is fitted about the sensor's x, y and z."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Where the tool rested.
+
+    Attributes:
+        target: Commanded angles, (pose, motor) [rad], log's sense.
+        point: Settled tool positions, (pose, 3) [m], in the sensor's frame.
+    """
+
+    target: FloatArray
+    point: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.target)
+
+    def __getitem__(self, kept: IntArray | slice) -> Poses:
+        """Return some of the poses."""
+        return Poses(self.target[kept], self.point[kept])
+
+    def spread(self, count: int) -> Poses:
+        """Return as many of the poses at most, evenly over all."""
+        if len(self) <= count:
+            return self
+        return self[np.rint(np.linspace(0, len(self) - 1, count)).astype(int)]
 
 
 @dataclass(frozen=True)

@@ -5,26 +5,35 @@ Section: docs/another_arm.md#fit-the-frame-and-the-geometry
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from failuretwin.connection.calibration.result import Parameter
-from failuretwin.connection.registration.arm import Arm, Fitted, Posterior, fit
-from failuretwin.connection.registration.poses import Poses, settled_poses
-from failuretwin.connection.registration.search import Registered, search
+from failuretwin.connection.registration.arm import Arm, Fitted, Poses, Posterior, fit
+from failuretwin.connection.registration.search import search
 from failuretwin.core.errors import InputError
-from failuretwin.core.runs import check_motors
+from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.digital_model.profile import Profile
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.settings import InferenceSettings
 from failuretwin.inference.set_ups.registration import align
 from failuretwin.inference.set_ups.set_ups import SetUp, extent, gross_unit, mistakes
 from failuretwin.inference.set_ups.wrong_setup import NEAR, wrong_setup
 
+if TYPE_CHECKING:
+    import xarray as xr
+
+FEWEST = 8
+"""Settled poses below which no frame is fitted: with six numbers of the frame and three of the tool
+that leaves one or two poses to tell a bad one by."""
 LEARNED = 0.5
 """A number is identified if poses bring its deviation below this share of the prior's."""
 NOT_TOLD = 0.7
@@ -94,9 +103,9 @@ def register(poses: Poses, robot: Robot, source: str = "", date: str = "") -> Re
     """
     arm = Arm.of(robot)
     _refuse_units(poses, robot)
-    found = search(arm, poses)
-    _refuse_misfit(found.best, poses, robot)
-    whole = _with_details(arm, found.best, poses)
+    best, others = search(arm, poses)
+    _refuse_misfit(best, poses, robot)
+    whole = _with_details(arm, best, poses)
     fitted = whole.fitted
     when = f" on {date}" if date else ""
     told = f"failuretwin robot fit{when}: {len(poses)} settled poses"
@@ -106,12 +115,38 @@ def register(poses: Poses, robot: Robot, source: str = "", date: str = "") -> Re
         parameters=_parameters(whole),
         poses=len(poses),
         before_mm=_middle_mm(poses.point - DigitalTwin(robot).path(poses.target)),
-        frames_mm=_middle_mm(_error(found.best, poses)),
+        frames_mm=_middle_mm(_error(best, poses)),
         after_mm=_unseen_mm(arm, whole, poses),
         noise_m=whole.told.noise,
         not_told=tuple(_not_told(whole)),
-        remarks=tuple(_remarks(robot, found, whole, poses)),
+        remarks=tuple(_remarks(robot, others, whole, poses)),
     )
+
+
+def settled_poses(runs: xr.Dataset, robot: Robot) -> Poses:
+    """Return the settled poses of healthy runs; runs that are labelled faulty are left out.
+
+    Nothing but commands and tool positions is read.
+
+    Raises:
+        InputError: If there are too few.
+    """
+    truth = truth_of(runs)
+    if truth is not None:
+        runs = runs.isel(run=[i for i, fault in enumerate(truth) if fault == "healthy"])
+    count = 0
+    if runs.sizes["run"]:
+        settled = Evidence(runs, InferenceSettings.of(robot)).sound.settled
+        usable = settled.usable
+        count = int(usable.sum())
+    if count < FEWEST:
+        unknowns = 4 * len(robot.motors) + 3
+        raise InputError(
+            f"the logs hold {count} poses in which a healthy arm rests, expected {FEWEST} at least "
+            f"for frame and tool point, and {2 * unknowns} or more for the geometry of "
+            f"{len(robot.motors)} joints. Let the arm rest in more poses, all over its range."
+        )
+    return Poses(settled.movements.target[usable], settled.point[usable])
 
 
 def _with_details(arm: Arm, found: Posterior, poses: Poses) -> Posterior:
@@ -284,11 +319,13 @@ def _spoken(fitted: Fitted, index: int) -> str:
     return f"{what} of {fitted.arm.robot.motors[unknown.motor].joint}"
 
 
-def _remarks(robot: Robot, found: Registered, whole: Posterior, poses: Poses) -> list[str]:
+def _remarks(
+    robot: Robot, others: Sequence[Posterior], whole: Posterior, poses: Poses
+) -> list[str]:
     names, sense = robot.motor_names, whole.fitted.start.sense
     turned = [n for n, now, was in zip(names, sense, robot.sensor_sense, strict=True) if now != was]
     remarks = [f"{name} turns the other way than the profile said" for name in turned]
-    remarks += [_either(names, sense, other) for other in found.others]
+    remarks += [_either(names, sense, other) for other in others]
     unknowns = len(whole.fitted.unknowns)
     if 3 * len(poses) < 6 * unknowns:
         remarks.append(

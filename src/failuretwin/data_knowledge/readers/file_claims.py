@@ -32,7 +32,7 @@ TEXT_CELL_BYTES = 64
 # NetCDF: HDF5 with conventions.
 
 
-def check_netcdf(path: Path, most_runs: int | None = None) -> None:
+def check_netcdf(path: Path, most_runs: int | None) -> None:
     """Raise InputError unless the arrays of a NetCDF file can be meant and lie in it alone.
 
     `most_runs` are in memory at a time; None: all.
@@ -76,7 +76,7 @@ MAY_BE_EMPTY = ("onset", "magnitude", "position", "temperature", "voltage")
 """Variables that may be unknown throughout; other writers leave out chunks that are all unknown."""
 
 
-def check_zarr(path: Path, most_runs: int | None = None) -> None:
+def check_zarr(path: Path, most_runs: int | None) -> None:
     """Raise InputError unless a Zarr store has only known codecs, sane sizes and all its chunks.
 
     `most_runs` are in memory at a time; None: all.

@@ -49,6 +49,12 @@ def is_lerobot(path: Path) -> bool:
     return (path / INFO_FILE).is_file()
 
 
+def find_lerobot(folder: Path) -> list[Path]:
+    """Return the LeRobot data sets at or below a folder, in order of their names."""
+    infos = sorted(files_below(folder, INFO_FILE.name))
+    return [file.parents[1] for file in infos if file.parent.name == INFO_FILE.parent.name]
+
+
 @dataclass(frozen=True)
 class LeRobotEpisodes:
     """Episodes of a LeRobot data set.

@@ -21,6 +21,7 @@ from failuretwin.data_knowledge.readers.column_guess import unambiguous_columns
 from failuretwin.data_knowledge.readers.column_map import ColumnMap
 from failuretwin.data_knowledge.readers.lerobot import (
     INFO_FILE,
+    find_lerobot,
     is_lerobot,
     read_lerobot,
 )
@@ -155,12 +156,14 @@ class Reader:
     """Reader of one kind of log.
 
     Attributes:
-        recognises: Whether a path that exists is a log of its kind.
-        read: Returns the run sets in such a path.
+        read: Returns the run sets in a log of its kind.
+        recognises: Whether a path that exists is one.
+        below: Returns the logs of its kind at or below a folder that is none itself.
     """
 
-    recognises: Callable[[Path], bool]
     read: Callable[[Path, Robot, ReadOptions], list[xr.Dataset]]
+    recognises: Callable[[Path], bool] = lambda path: False
+    below: Callable[[Path], list[Path]] = lambda folder: []
 
 
 @dataclass(frozen=True)
@@ -214,11 +217,7 @@ def _logs_in(path: Path, options: ReadOptions) -> list[Log]:
 
 
 def _logs_below(path: Path, options: ReadOptions) -> list[Log]:
-    found = [Log(folder, _read_session) for folder in find_sessions(path)]
-    found += [Log(file, _read_matlab) for file in find_matlab_files(path)]
-    infos = sorted(files_below(path, INFO_FILE.name))
-    sets = [file.parents[1] for file in infos if file.parent.name == INFO_FILE.parent.name]
-    found += [Log(folder, _read_lerobot) for folder in sets]
+    found = [Log(log, reader.read) for reader in READERS for log in reader.below(path)]
     if not found and options.columns is not None:
         found = [Log(file, _read_csv) for file in sorted(files_below(path, "*.csv"))]
     if not found:
@@ -267,11 +266,14 @@ def _read_csv(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset
 
 
 READERS = (
-    Reader(lambda path: path.suffix in SUFFIXES, _read_run_set),
-    Reader(is_bag, _read_bag),
-    Reader(is_lerobot, _read_lerobot),
-    Reader(lambda path: path.suffix == ".mat" and not path.is_dir(), _read_matlab),
-    Reader(lambda path: not path.is_dir() and (path.suffix == ".csv" or is_rtde(path)), _read_csv),
+    Reader(_read_run_set, lambda path: path.suffix in SUFFIXES),
+    Reader(_read_bag, is_bag),
+    Reader(_read_session, below=find_sessions),
+    Reader(
+        _read_matlab, lambda path: path.suffix == ".mat" and not path.is_dir(), find_matlab_files
+    ),
+    Reader(_read_lerobot, is_lerobot, find_lerobot),
+    Reader(_read_csv, lambda path: not path.is_dir() and (path.suffix == ".csv" or is_rtde(path))),
 )
 """Readers of all kinds of logs; the first one that recognises a path reads it."""
 

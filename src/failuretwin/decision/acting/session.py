@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from failuretwin.connection.life_history import read_rows
 from failuretwin.connection.links.base import Commander
+from failuretwin.connection.tracked_diagnosis import read_rows
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.actor import Actor
