@@ -13,21 +13,19 @@ Section: docs/reading_logs.md#joint-offsets
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp, softmax
 
 from failuretwin.core.hypothesis import SURE, Interval
+from failuretwin.core.runs import RunSet
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, sag
 from failuretwin.failure_behavior.modes import EncoderBias
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 STILL_RAD, STILL_S = 3.5e-3, 0.3
 """Joints stand still if they turn through no more in this time: about 0.2 deg [rad, s]."""
@@ -84,7 +82,7 @@ class _Stops(NamedTuple):
     error: list[float]
 
 
-def joint_offsets(runs: xr.Dataset, robot: Robot, known: Imperfections) -> tuple[JointOffset, ...]:
+def joint_offsets(runs: RunSet, robot: Robot, known: Imperfections) -> tuple[JointOffset, ...]:
     """Return the offset of each joint that follows its commands and stops often enough.
 
     A stuck motor does not follow, so it has none. Runs have `command` and `position`. Where the

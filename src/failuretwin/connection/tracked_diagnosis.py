@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from failuretwin.core.config import fingerprint
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.foreign import read_text, reading
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.core.runs import check_motors, truths_of
+from failuretwin.core.runs import RunSet, check_motors, truths_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.readers.file_claims import check_npz
 from failuretwin.data_knowledge.store import check_writable, replacing
@@ -47,9 +47,6 @@ from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.together.life_filter import LifeFilter
 from failuretwin.inference.together.mixed_runs import of_second_robot, two_robots
 from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 BATCH, SHARE = 10, 4
 """Runs that are judged with the same belief at most, and how many runs must have come for each:
@@ -134,7 +131,7 @@ def begin(diagnoser: BayesDiagnoser, cold: bool, limits: WearLimits | None = Non
 
 
 def diagnose_tracked(
-    runs: xr.Dataset,
+    runs: RunSet,
     diagnoser: BayesDiagnoser,
     history: History,
     advance: Callable[[int], None] = lambda done: None,
@@ -186,7 +183,7 @@ def _mixed(life: LifeFilter, rows: list[dict[str, Any]]) -> str:
 
 
 def _batches(
-    runs: xr.Dataset, keys: list[str], known: set[str], cold: bool, life: LifeFilter
+    runs: RunSet, keys: list[str], known: set[str], cold: bool, life: LifeFilter
 ) -> Iterator[IntArray]:
     """Yield the runs that are new, in their order, some of one session at a time."""
     sessions, batch = session_names(runs), list[int]()
@@ -240,7 +237,7 @@ class _Seen:
         seen: What they say.
     """
 
-    runs: xr.Dataset
+    runs: RunSet
     diagnoser: BayesDiagnoser
     seen: Evidence
 
@@ -291,7 +288,7 @@ class _Seen:
         return with_timing_of(now, movements, self.diagnoser.twin.robot)
 
 
-def calibration_of(life: LifeFilter, runs: xr.Dataset) -> Calibration:
+def calibration_of(life: LifeFilter, runs: RunSet) -> Calibration:
     """Return what a life has taught by its latest runs, as a calibration that anybody may use."""
     robot, found = life.model.twin.robot, life.told
     told = as_calibration(found, life.begun, robot, runs)

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -53,7 +52,7 @@ from failuretwin.connection.calibration.timing_fit import (
     transients,
 )
 from failuretwin.core.errors import InputError
-from failuretwin.core.runs import check_motors, truth_of
+from failuretwin.core.runs import RunSet, check_motors, truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.digital_model.arm_classes import class_of
@@ -62,9 +61,6 @@ from failuretwin.digital_model.robot import Robot, load_robot, shown_unit
 from failuretwin.inference.isolability import fault_probabilities
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.sensors import TOOL_ALONE, sensing_of
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 # Which runs had better not teach the twin, and why.
 
@@ -93,13 +89,13 @@ def exclude_suspect_runs(
 
 
 def fit_calibration(
-    runs: xr.Dataset,
+    runs: RunSet,
     robot: Robot,
     name: str,
     source: str,
     *,
     fault_probability: FloatArray | None = None,
-    judged: xr.Dataset | None = None,
+    judged: RunSet | None = None,
     thorough: bool = True,
 ) -> Calibration:
     """Learn the imperfections of a robot from healthy runs.
@@ -174,7 +170,7 @@ def fit_calibration(
     )
 
 
-def _held_out(part: SettlingFit, robot: Robot, judged: xr.Dataset | None) -> tuple[HeldOut, ...]:
+def _held_out(part: SettlingFit, robot: Robot, judged: RunSet | None) -> tuple[HeldOut, ...]:
     if judged is None:
         return cross_validate(part, robot)
     unseen = observe(judged, robot)
@@ -273,7 +269,7 @@ def _with_sensors(found: Calibration, fits: Sequence[SensorFit]) -> Calibration:
     )
 
 
-def _of_sensors_alone(runs: xr.Dataset, robot: Robot, name: str, source: str) -> Calibration:
+def _of_sensors_alone(runs: RunSet, robot: Robot, name: str, source: str) -> Calibration:
     """Return a calibration of sensors by runs of which nobody saw the tool's position.
 
     Raises:
@@ -297,7 +293,7 @@ def _of_sensors_alone(runs: xr.Dataset, robot: Robot, name: str, source: str) ->
     return _with_sensors(plain, fits)
 
 
-def _without_faulty_labels(runs: xr.Dataset) -> tuple[xr.Dataset, tuple[LeftOut, ...]]:
+def _without_faulty_labels(runs: RunSet) -> tuple[RunSet, tuple[LeftOut, ...]]:
     truth = truth_of(runs)
     if truth is None:
         return runs, ()
@@ -314,7 +310,7 @@ def _without_faulty_labels(runs: xr.Dataset) -> tuple[xr.Dataset, tuple[LeftOut,
     return runs.isel(run=np.flatnonzero(healthy)), labelled
 
 
-def _held_out_runs(runs: xr.Dataset, hold_out: str | None) -> np.ndarray:
+def _held_out_runs(runs: RunSet, hold_out: str | None) -> np.ndarray:
     sessions = session_names(runs)
     inside = np.array([hold_out is not None and hold_out in session for session in sessions])
     known = ", ".join(dict.fromkeys(sessions))
@@ -337,7 +333,7 @@ def _refuse_scatter(first: Calibration, robot: Robot) -> None:
             )
 
 
-def _refuse_suspects(runs: xr.Dataset, doubt: FloatArray) -> None:
+def _refuse_suspects(runs: RunSet, doubt: FloatArray) -> None:
     suspects = np.flatnonzero(doubt >= SUSPECT)
     if len(suspects) > MOST_SUSPECT * len(doubt):
         names = [str(runs["run"].values[i]) for i in suspects[:5]]

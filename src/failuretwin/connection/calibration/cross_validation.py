@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,15 +27,13 @@ from failuretwin.connection.calibration.timing_fit import (
 )
 from failuretwin.core.errors import InputError
 from failuretwin.core.numerics import log_student
+from failuretwin.core.runs import RunSet
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.observation.healthy_model import PATH_NOISE_M, HealthyModel
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 TO_DEVIATION = 1.4826
 """Median absolute deviation to standard deviation of a normal distribution."""
@@ -167,7 +164,7 @@ class Predictions:
     unseen: bool
 
 
-def trusted_runs(found: Calibration, runs: xr.Dataset) -> xr.Dataset:
+def trusted_runs(found: Calibration, runs: RunSet) -> RunSet:
     """Return the runs that were not left out as a whole."""
     out = {entry.run for entry in found.left_out if entry.movement == 0}
     kept = [i for i, run in enumerate(runs["run"].values) if str(run) not in out]
@@ -179,7 +176,7 @@ def settling_of(found: Calibration, robot: Robot) -> Settling:
     return found.imperfections.settling or Settling.ideal(len(robot.motors))
 
 
-def predict(found: Calibration, runs: xr.Dataset, robot: Robot) -> Predictions:
+def predict(found: Calibration, runs: RunSet, robot: Robot) -> Predictions:
     """Return what the calibration expects of the sessions held out.
 
     Where none were, each session is expected by a fit to the others; with one session alone, by
@@ -198,7 +195,7 @@ def predict(found: Calibration, runs: xr.Dataset, robot: Robot) -> Predictions:
     return _predictions(seen, found, robot, pose, unseen)
 
 
-def _observed(found: Calibration, runs: xr.Dataset, robot: Robot) -> Observations:
+def _observed(found: Calibration, runs: RunSet, robot: Robot) -> Observations:
     """Return the movements of trusted runs, of a robot with the payload of the calibration."""
     seen = observe(trusted_runs(found, runs), robot)
     payload = settling_of(found, robot).payload
@@ -282,9 +279,7 @@ class ExampleTransient:
     of_motors: bool
 
 
-def example_transient(
-    found: Calibration, runs: xr.Dataset, robot: Robot
-) -> ExampleTransient | None:
+def example_transient(found: Calibration, runs: RunSet, robot: Robot) -> ExampleTransient | None:
     """Return the movement that the calibrated twin fits neither well nor badly, but typically.
 
     It is taken from the longer half of the movements that began on time at a known place; None if

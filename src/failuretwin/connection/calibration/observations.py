@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.core.runs import measured_rate
+from failuretwin.core.runs import RunSet, measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Readings
@@ -18,9 +17,6 @@ from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.sensors import TOOL_ALONE
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 ROUNDING = float(1.0 / np.sqrt(12.0))
 """Standard deviation of what whole numbers round off."""
@@ -115,13 +111,13 @@ class Observations:
         return self.model.sensors.angles(self.evidence.point[self.at])
 
 
-def session_names(runs: xr.Dataset) -> list[str]:
+def session_names(runs: RunSet) -> list[str]:
     """Return the session of each run: its name without the last part, or its own name."""
     names = [str(name) for name in runs["run"].values]
     return [name.rpartition("/")[0] or name for name in names]
 
 
-def observe(runs: xr.Dataset, robot: Robot) -> Observations:
+def observe(runs: RunSet, robot: Robot) -> Observations:
     """Return where movements settled, by the motors' own readings where the runs have them."""
     of_motors = "position" in runs
     model = uncalibrated(robot, of_motors, measured_rate(runs))

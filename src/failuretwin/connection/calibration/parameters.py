@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import brentq
@@ -18,16 +17,13 @@ from failuretwin.connection.calibration.settling_fit import (
 )
 from failuretwin.connection.calibration.timing_fit import BOUNDS, TimingFit
 from failuretwin.core.movements import Movements
-from failuretwin.core.runs import measured_rate
+from failuretwin.core.runs import RunSet, measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.arm_classes import class_of
 from failuretwin.digital_model.nonidealities import LostCommand, Range, Readings, Schedule, Timing
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import largest_load
 from failuretwin.inference.together.habits import HEAVIEST, RATE_COUNT
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 # How often things go wrong by chance, from counts in healthy logs.
 
@@ -139,7 +135,7 @@ def loss_rates(
     return rates
 
 
-def glitch_rates(runs: xr.Dataset) -> list[Rate] | None:
+def glitch_rates(runs: RunSet) -> list[Rate] | None:
     """Return the share of spoilt readings of each motor; None where motors were not read."""
     if "position" not in runs:
         return None
@@ -352,7 +348,7 @@ def schedule_of(movements: Movements, late: FloatArray, robot: Robot) -> Schedul
     )
 
 
-def readings_of(runs: xr.Dataset, robot: Robot, glitches: Sequence[Rate] | None) -> Readings:
+def readings_of(runs: RunSet, robot: Robot, glitches: Sequence[Rate] | None) -> Readings:
     """Return how the sensors sample: their rate, whole counts, spoilt readings."""
     whole = False
     if robot.profile.servo_units is not None and "position" in runs:

@@ -8,22 +8,18 @@ lag, Gauss-Newton with robust weights finds x_r of every run.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from failuretwin.connection.calibration.settling_fit import SettlingFit
 from failuretwin.core.movements import Movements, find_movements
-from failuretwin.core.runs import measured_rate
+from failuretwin.core.runs import RunSet, measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.digital_model.disturbances import lagged
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, sag
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.observation.readings import measured_samples
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 LONGEST_LAG_S = 0.08
 """Longest lag looked for [s]."""
@@ -254,7 +250,7 @@ def punctual(late: FloatArray) -> BoolArray:
     return np.asarray(late == 0.0) if np.any(late > 0.0) else np.ones(late.shape, dtype=bool)
 
 
-def gap_starts(runs: xr.Dataset, movements: Movements, late: FloatArray) -> FloatArray:
+def gap_starts(runs: RunSet, movements: Movements, late: FloatArray) -> FloatArray:
     """Return when readings stop before late starts, after the movement before, (gap,) [s]."""
     time, rate = as_floats(runs["time"].values), measured_rate(runs)
     seen = measured_samples(runs).seen
@@ -273,7 +269,7 @@ def gap_starts(runs: xr.Dataset, movements: Movements, late: FloatArray) -> Floa
 
 
 def transients(
-    runs: xr.Dataset,
+    runs: RunSet,
     movements: Movements,
     late: FloatArray,
     part: SettlingFit,
@@ -336,6 +332,6 @@ def unloaded_movements(movements: Movements, settling: Settling) -> Movements:
     )
 
 
-def movements_of(runs: xr.Dataset) -> Movements:
+def movements_of(runs: RunSet) -> Movements:
     """Return the movements of a run set."""
     return find_movements(as_floats(runs["command"].values), as_floats(runs["time"].values))

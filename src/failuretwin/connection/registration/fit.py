@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from failuretwin.connection.calibration.result import Parameter
 from failuretwin.connection.registration.arm import Arm, Fitted, Poses, Posterior, fit
 from failuretwin.connection.registration.search import search
 from failuretwin.core.errors import InputError
-from failuretwin.core.runs import check_motors, truth_of
+from failuretwin.core.runs import RunSet, check_motors, truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.digital_model.profile import Profile
@@ -27,9 +26,6 @@ from failuretwin.inference.observation.settings import InferenceSettings
 from failuretwin.inference.set_ups.registration import align
 from failuretwin.inference.set_ups.set_ups import SetUp, extent, gross_unit, mistakes
 from failuretwin.inference.set_ups.wrong_setup import NEAR, wrong_setup
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 FEWEST = 8
 """Settled poses below which no frame is fitted: with six numbers of the frame and three of the tool
@@ -123,7 +119,7 @@ def register(poses: Poses, robot: Robot, source: str = "", date: str = "") -> Re
     )
 
 
-def settled_poses(runs: xr.Dataset, robot: Robot) -> Poses:
+def settled_poses(runs: RunSet, robot: Robot) -> Poses:
     """Return the settled poses of healthy runs; runs that are labelled faulty are left out.
 
     Nothing but commands and tool positions is read.
