@@ -101,7 +101,7 @@ class Tracked:
 def begin(diagnoser: BayesDiagnoser, cold: bool, limits: WearLimits | None = None) -> LifeFilter:
     """Return what is believed of a robot before any run.
 
-    That is its calibration, or, cold, what its kind is like.
+    That is what its calibration says, or, if it begins cold, what robots of its kind are like.
 
     Raises:
         InputError: If it is not said where motors settle, or no hypothesis says where they do.
@@ -308,7 +308,7 @@ def history_path(calibration: Path) -> Path:
 def open_history(calibration: Path, start: LifeFilter, cold: bool) -> History:
     """Return the history beside a calibration; where there is none, it begins with `start`.
 
-    That is what is believed before any run; `cold`: what the robot's kind is like.
+    `start` is the belief before any run; a cold one is what robots of its kind are like.
 
     Raises:
         InputError: If the history cannot be read, is damaged, or has begun with something else.

@@ -54,7 +54,7 @@ def flaw_of_readings(time: FloatArray, rest: FloatArray) -> str:
 
 
 def flaw_of_motion(start: float, settled: float, target: float) -> str:
-    """Return why a motor is no healthy one, or nothing; all angles in [counts]."""
+    """Return why a motor is not healthy, or nothing; angles are in servo counts."""
     travel = target - start
     if abs(travel) < SMALLEST_COUNTS:
         return f"is told to move by {abs(travel):.0f} counts only"

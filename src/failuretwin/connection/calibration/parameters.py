@@ -192,7 +192,7 @@ def settling_parameters(fit: SettlingPosterior, robot: Robot, payload: float) ->
     found = []
     for group, (name, unit) in enumerate(SETTLING_UNITS.items()):
         for k, motor in enumerate(robot.motor_names):
-            at = group * fit.motors + k
+            at = group * len(load) + k
             value, deviation = float(fit.mode[at]), float(fit.deviation[at])
             learned = bool(deviation < LEARNED * fit.prior_deviation[at])
             note = "" if learned else f"the logs do not say; it takes {ADVICE[name]}"

@@ -66,11 +66,6 @@ class SettlingPosterior:
     prior_deviation: FloatArray
 
     @property
-    def motors(self) -> int:
-        """Number of motors."""
-        return (len(self.mode) - 1) // 4
-
-    @property
     def deviation(self) -> FloatArray:
         """Standard deviation of each parameter, (4 n + 1,)."""
         return np.sqrt(np.diag(self.covariance))
@@ -92,7 +87,7 @@ class SortedMovements:
 
     @classmethod
     def of(cls, observations: Observations, model: HealthyModel) -> SortedMovements:
-        """Return what became of movements; the robot, with their sensors, is not in doubt."""
+        """Return what became of movements, as the sensors of a robot beyond doubt saw them."""
         likelihood = RunLikelihood(observations.evidence, model.without_doubt)
         share = likelihood.outcome_probability[observations.at]
         sound = share.sum(axis=-1)
@@ -174,7 +169,7 @@ class SettlingFit:
         return self.sorted.log_likelihood + offsets
 
     def without(self, runs: BoolArray) -> SettlingFit:
-        """Return the fit without some runs (run,), found from here.
+        """Return the fit to all runs but some, a mask (run,), found from here.
 
         Raises:
             InputError: If too few movements are left.

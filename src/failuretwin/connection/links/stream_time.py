@@ -46,7 +46,7 @@ class StreamClock:
     def to_stream_time(self, stamp: float, now_s: float, reading: bool = False) -> float:
         """Return the stream time of an event [s], by its stamp and our own monotonic clock [s].
 
-        Commands may be late, readings are not.
+        A reading shows a clock that was set back; a command may just be late.
         """
         if self._offset is None:
             self._offset, self._seen_s = -stamp, now_s

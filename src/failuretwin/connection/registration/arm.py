@@ -37,7 +37,7 @@ from failuretwin.digital_model.geometry import (
 from failuretwin.digital_model.kinematics import Loads, SerialChain, rotation_to_z
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import poses_in_range
-from failuretwin.digital_model.urdf.file import Triple, UrdfJoint, read_urdf, transform
+from failuretwin.digital_model.urdf.file import Triple, Urdf, read_urdf, transform
 from failuretwin.inference.set_ups.registration import Frame
 
 # Standard deviations of what is believed before any pose is seen.
@@ -141,31 +141,29 @@ class Start:
 
 @dataclass(frozen=True)
 class Arm:
-    """An arm by its URDF, with the tool point of its profile.
+    """An arm by its URDF, with the tool point of its profile, which says nothing else of geometry.
 
     Attributes:
         robot: The robot.
-        urdf_joints: Its moving joints as the URDF states them, base to tool.
-        chain: Its chain in the frame of the base link, to the tool link.
     """
 
     robot: Robot
-    urdf_joints: tuple[UrdfJoint, ...]
-    chain: SerialChain
-
-    @classmethod
-    def of(cls, robot: Robot) -> Arm:
-        """Return the arm of a robot without what its profile says of geometry."""
-        urdf, profile = read_urdf(robot.urdf_file), robot.profile
-        names = [motor.joint for motor in robot.motors]
-        by_name = {joint.name: joint for joint in urdf.joints}
-        chain = urdf.chain(profile.base_link, profile.tool_link, names)
-        return cls(robot, tuple(by_name[name] for name in names), chain)
 
     @property
     def motors(self) -> int:
         """Number of motors."""
-        return len(self.urdf_joints)
+        return len(self.robot.motors)
+
+    @cached_property
+    def urdf(self) -> Urdf:
+        """The URDF."""
+        return read_urdf(self.robot.urdf_file)
+
+    @cached_property
+    def chain(self) -> SerialChain:
+        """Chain in the frame of the base link, to the tool link."""
+        profile, names = self.robot.profile, [motor.joint for motor in self.robot.motors]
+        return self.urdf.chain(profile.base_link, profile.tool_link, names)
 
     @cached_property
     def slides(self) -> list[bool]:
@@ -208,8 +206,7 @@ class Arm:
     @cached_property
     def gravity(self) -> Loads:
         """What the motors carry, as the URDF has it."""
-        urdf = read_urdf(self.robot.urdf_file)
-        return urdf.loads(self.robot.profile.base_link, self.chain)
+        return self.urdf.loads(self.robot.profile.base_link, self.chain)
 
     def torque(self, target: FloatArray, start: Start) -> FloatArray:
         """Return the torque of gravity in poses, (pose, motor) [N m], driving the seen joint up.
@@ -338,13 +335,11 @@ class Fitted:
         return Geometry(joints, self.scale, noise_m, source)
 
     def _correction(self, j: int) -> JointCorrection:
-        joint = self.arm.urdf_joints[j]
-        turn = np.eye(4)
-        turn[:3, :3] = rotation_to_z(joint.axis)
+        name, turn = self.arm.chain.joints[j].name, np.eye(4)
+        axis = next(joint.axis for joint in self.arm.urdf.joints if joint.name == name)
+        turn[:3, :3] = rotation_to_z(axis)
         T = turn @ _across(self.moved(j)) @ turn.T
-        return JointCorrection(
-            joint.name, self.zero(j), _triple(T[:3, 3]), roll_pitch_yaw(T[:3, :3])
-        )
+        return JointCorrection(name, self.zero(j), _triple(T[:3, 3]), roll_pitch_yaw(T[:3, :3]))
 
 
 @dataclass(frozen=True)

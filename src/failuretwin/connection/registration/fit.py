@@ -97,7 +97,7 @@ def register(poses: Poses, robot: Robot, source: str = "", date: str = "") -> Re
     Raises:
         InputError: As `fit_registration`.
     """
-    arm = Arm.of(robot)
+    arm = Arm(robot)
     _refuse_units(poses, robot)
     best, others = search(arm, poses)
     _refuse_misfit(best, poses, robot)
