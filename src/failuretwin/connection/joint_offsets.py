@@ -13,7 +13,6 @@ Section: docs/reading_logs.md#joint-offsets
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp, softmax
@@ -73,15 +72,6 @@ class JointOffset:
         return self.steady and self.probability >= SURE
 
 
-class _Stops(NamedTuple):
-    """Stops of one joint: rows of the run set (run, time) and direction of the travel before."""
-
-    run: list[int]
-    row: list[int]
-    direction: list[float]
-    error: list[float]
-
-
 def joint_offsets(runs: RunSet, robot: Robot, known: Imperfections) -> tuple[JointOffset, ...]:
     """Return the offset of each joint that follows its commands and stops often enough.
 
@@ -98,19 +88,26 @@ def joint_offsets(runs: RunSet, robot: Robot, known: Imperfections) -> tuple[Joi
     found = []
     for k, motor in enumerate(robot.motor_names):
         stops = _stops(command[..., k], position[..., k], time)
-        at = command[stops.run, stops.row]
-        errors = np.array(stops.error)
-        if len(at) < FEWEST_STOPS or errors.std() > FOLLOWS * at[:, k].std():
+        if len(stops) < FEWEST_STOPS:
+            continue
+        run, row, direction, errors = map(np.array, zip(*stops, strict=True))
+        at = command[run, row]
+        if errors.std() > FOLLOWS * at[:, k].std():
             continue
         load = sag(robot, at, np.asarray(settling.compliance), settling.payload)[:, k]
-        rows = np.stack([np.ones(len(at)), -np.array(stops.direction), load], axis=1)
+        rows = np.stack([np.ones(len(at)), -direction, load], axis=1)
         found.append(_offset(motor, k, errors, rows, settling, variation))
     return tuple(found)
 
 
-def _stops(command: FloatArray, position: FloatArray, time: FloatArray) -> _Stops:
-    """Return the stops of one joint, of commands and readings (run, time) [rad]."""
-    found = _Stops([], [], [], [])
+def _stops(
+    command: FloatArray, position: FloatArray, time: FloatArray
+) -> list[tuple[int, int, float, float]]:
+    """Return run, row, direction of the travel before and error [rad] of each stop of one joint.
+
+    Commands and readings are (run, time) [rad].
+    """
+    found = []
     for run, (asked, seen) in enumerate(zip(command, position, strict=True)):
         rows = np.flatnonzero(np.isfinite(seen))
         last: float | None = None
@@ -122,10 +119,9 @@ def _stops(command: FloatArray, position: FloatArray, time: FloatArray) -> _Stop
             if last is not None and abs(here - last) < TRAVEL_RAD:
                 continue
             last = here
-            found.run.append(run)
-            found.row.append(int(settled[0]))
-            found.direction.append(float(np.sign(here - before[far[-1]])) if len(far) else 0.0)
-            found.error.append(float(np.median(seen[settled] - asked[settled])))
+            direction = float(np.sign(here - before[far[-1]])) if len(far) else 0.0
+            error = float(np.median(seen[settled] - asked[settled]))
+            found.append((run, int(settled[0]), direction, error))
     return found
 
 

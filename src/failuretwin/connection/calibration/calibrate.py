@@ -130,8 +130,10 @@ def fit_calibration(
             part = fit_settling(part.observations.of(model))
     movements = movements_of(kept)
     late = lateness(movements)
-    losses = loss_rates(part.observations, part.sorted.lost, punctual(late), late > 0.0, robot)
-    timing = fit_timing(transients(kept, movements, late, part, part.settling, robot), robot)
+    seen, became = part.observations, part.sorted
+    losses = loss_rates(seen, became.lost, punctual(late), late > 0.0, robot)
+    ramps = transients(kept, movements, late, seen, became, part.settling, robot)
+    timing = fit_timing(ramps, robot)
     gaps = gap_starts(kept, movements, late)
     glitches = glitch_rates(kept) if part.observations.of_motors else None
     imperfections = Imperfections(

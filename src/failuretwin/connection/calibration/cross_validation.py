@@ -202,6 +202,12 @@ def _observed(found: Calibration, runs: RunSet, robot: Robot) -> Observations:
     return seen.of(uncalibrated(robot, seen.of_motors, payload=payload))
 
 
+def _sorted(seen: Observations, found: Calibration) -> SortedMovements:
+    """Return what became of movements by a calibration."""
+    known = replace(found.imperfections, sensors=seen.model.imperfections.sensors)
+    return SortedMovements.of(seen, replace(seen.model, imperfections=known))
+
+
 def _expected_by_others(seen: Observations, robot: Robot) -> FloatArray | None:
     """Return the angles expected by fits to other sessions; None where too little is left."""
     groups, run = min(len(seen.sessions), MOST_FOLDS), seen.at[0]
@@ -220,10 +226,8 @@ def _expected_by_others(seen: Observations, robot: Robot) -> FloatArray | None:
 def _predictions(
     seen: Observations, found: Calibration, robot: Robot, pose: FloatArray, unseen: bool
 ) -> Predictions:
-    settling = settling_of(found, robot)
-    known = replace(found.imperfections, sensors=seen.model.imperfections.sensors)
-    sorting = SortedMovements.of(seen, replace(seen.model, imperfections=known))
-    lost, odd = sorting.lost, sorting.odd
+    settling, became = settling_of(found, robot), _sorted(seen, found)
+    lost, odd = became.lost, became.odd
     twin, scatter = DigitalTwin(robot), np.asarray(settling.scatter)
     error = settled_errors(seen, robot, None)
     if seen.position is not None:
@@ -287,10 +291,9 @@ def example_transient(found: Calibration, runs: RunSet, robot: Robot) -> Example
     """
     runs = trusted_runs(found, runs)
     settling = settling_of(found, robot)
-    part = fit_settling(_observed(found, runs, robot))
-    movements = movements_of(runs)
-    # What is shown is the calibration, which may have seen fewer sessions than this fit.
-    ramps = transients(runs, movements, lateness(movements), part, settling, robot)
+    seen, movements = _observed(found, runs, robot), movements_of(runs)
+    became = _sorted(seen, found)
+    ramps = transients(runs, movements, lateness(movements), seen, became, settling, robot)
     twin = DigitalTwin(robot)
     timing = found.imperfections.timing
     usual = np.array([np.mean(timing.delay_s), np.mean(timing.ramp_shortening)])

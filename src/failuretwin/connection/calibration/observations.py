@@ -156,13 +156,8 @@ def uncalibrated(
     return HealthyModel(DigitalTwin(robot), known, sensing=sensing)
 
 
-def count_of(robot: Robot) -> float:
-    """Return the step that the motors are read in [rad]; 0 without servo units."""
+def rounding(robot: Robot) -> float:
+    """Return the standard deviation of what servo counts round off [rad]; 0 without any."""
     if robot.profile.servo_units is None:
         return 0.0
-    return float(abs(robot.servo_units.rad_per_count))
-
-
-def rounding(robot: Robot) -> float:
-    """Return the standard deviation of what whole servo counts round off [rad]."""
-    return count_of(robot) * ROUNDING
+    return float(abs(robot.servo_units.rad_per_count)) * ROUNDING

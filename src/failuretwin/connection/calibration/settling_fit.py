@@ -114,11 +114,6 @@ class SettlingFit:
         """Where motors settle, payload included."""
         return replace(self.together.learned.settling, source="fit")
 
-    @property
-    def payload(self) -> float:
-        """Mass at the tool point that the fit knows of [kg]."""
-        return self.settling.payload
-
     @cached_property
     def fit(self) -> SettlingPosterior:
         """Where motors settle, with covariance."""
@@ -283,7 +278,8 @@ def sense_remarks(part: SettlingFit, robot: Robot) -> list[str]:
     loaded = np.flatnonzero(largest_load(robot, 0.0) > 1e-6)
     elsewhere = _far_if_turned(part, robot)
     best, fit, odds = _best_senses(part, robot, loaded[~elsewhere[loaded]].tolist())
-    sag = np.abs(np.asarray(fit.settling.compliance) * largest_load(best, part.payload))
+    payload = part.settling.payload
+    sag = np.abs(np.asarray(fit.settling.compliance) * largest_load(best, payload))
     remarks = []
     for k, motor in enumerate(robot.motors):
         sense = best.motors[k].sense
@@ -333,7 +329,7 @@ def _best_senses(
     """
     best, fit = robot, part
     while True:
-        turned = {k: _refit(part, _with_turned(best, k), part.payload) for k in loaded}
+        turned = {k: _refit(part, _with_turned(best, k), part.settling.payload) for k in loaded}
         ahead = {k: fit.log_posterior - other.log_posterior for k, other in turned.items()}
         k = min(ahead, key=lambda motor: ahead[motor], default=None)
         if k is None or -ahead[k] <= SURE_NATS:

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.connection.calibration.settling_fit import SettlingFit
+from failuretwin.connection.calibration.observations import Observations
+from failuretwin.connection.calibration.settling_fit import SortedMovements
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.runs import RunSet, measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
@@ -272,14 +273,15 @@ def transients(
     runs: RunSet,
     movements: Movements,
     late: FloatArray,
-    part: SettlingFit,
+    seen: Observations,
+    became: SortedMovements,
     settling: Settling,
     robot: Robot,
 ) -> Transients:
     """Return the readings on ramps that began on time and at a known place."""
     time = as_floats(runs["time"].values)
-    used = _on_time(movements, late, part, time)
-    of_motors = part.observations.of_motors
+    used = _within(movements, _sound(movements, seen, became) & punctual(late), time)
+    of_motors = seen.of_motors
     reading = as_floats(runs["position"].values) if of_motors else measured_samples(runs).point
     free = unloaded_movements(movements, settling)
     if of_motors:
@@ -297,24 +299,21 @@ def transients(
     )
 
 
-def _on_time(
-    movements: Movements, late: FloatArray, part: SettlingFit, time: FloatArray
-) -> BoolArray:
-    """Return which times belong to a ramp that began on time at a known place, (run, time)."""
-    on_time = _sound(movements, part) & punctual(late)
+def _within(movements: Movements, chosen: BoolArray, time: FloatArray) -> BoolArray:
+    """Return which times belong to the ramps of some movements, (run, time)."""
     used = np.zeros((len(movements.start), len(time)), dtype=bool)
-    for run, movement in np.argwhere(on_time):
+    for run, movement in np.argwhere(chosen):
         begin = movements.start[run, movement]
         end = begin + np.nanmax(movements.ramp_duration[run, movement]) + AFTER_RAMP_S
         used[run] |= (time >= begin) & (time < end)
     return used
 
 
-def _sound(movements: Movements, part: SettlingFit) -> BoolArray:
-    """Return which movements began and ended where the fit says, (run, movement)."""
-    good, seen = np.zeros(movements.start.shape, dtype=bool), part.observations
+def _sound(movements: Movements, seen: Observations, became: SortedMovements) -> BoolArray:
+    """Return which movements began and ended where they should, (run, movement)."""
+    good = np.zeros(movements.start.shape, dtype=bool)
     run, number = seen.at
-    fine = ~part.sorted.odd & ~part.sorted.lost.any(axis=1)
+    fine = ~became.odd & ~became.lost.any(axis=1)
     good[run[fine], number[fine]] = True
     before = np.ones_like(good)
     before[:, 1:] = good[:, :-1]

@@ -343,15 +343,13 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class Posterior:
-    """An arm fitted to poses.
+class Posterior(Fitted):
+    """The most probable arm by poses.
 
     Attributes:
-        fitted: Its most probable numbers.
         told: The fit, in units of what was believed before and metres.
     """
 
-    fitted: Fitted
     told: StudentFit
 
 
@@ -367,7 +365,7 @@ def fit(
 
     begin = np.zeros(len(unknowns)) if begin is None else begin
     told = fit_student(residual, begin / spread, 3)
-    return Posterior(Fitted(arm, start, unknowns, told.value * spread), told)
+    return Posterior(arm, start, unknowns, told.value * spread, told)
 
 
 def _triple(values: FloatArray) -> Triple:

@@ -59,7 +59,7 @@ def search(arm: Arm, poses: Poses) -> tuple[Posterior, list[Posterior]]:
     best = max(found, key=lambda one: _score(arm, one))
     found += [_registered(arm, one, few) for one in _one_turned(arm, few, best)]
     found.sort(key=lambda one: one.told.log_likelihood)
-    known = {tuple(one.fitted.start.sense.tolist()): one for one in found}
+    known = {tuple(one.start.sense.tolist()): one for one in found}
     order = sorted(known.values(), key=lambda one: -_score(arm, one))
     top = order[0]
     ties = [f for f in order[1:] if f.told.log_likelihood > top.told.log_likelihood - SURE_NATS]
@@ -76,15 +76,14 @@ def _fitted(arm: Arm, starts: list[Start], poses: Poses) -> list[Posterior]:
 def _score(arm: Arm, found: Posterior) -> float:
     """Return the log posterior of senses: the profile's own, and a base that is upright."""
     own = arm.robot.sensor_sense
-    turned = int(np.sum(found.fitted.start.sense != own))
-    upright = found.fitted.turn[2, 2] > 0.0
+    turned = int(np.sum(found.start.sense != own))
+    upright = found.turn[2, 2] > 0.0
     return found.told.log_likelihood - TURN_NATS * turned + TURN_NATS * upright
 
 
 def _as_start(found: Posterior) -> Start:
-    fitted = found.fitted
-    zero = np.array([fitted.zero(j) for j in range(fitted.arm.motors)])
-    return Start(fitted.start.sense, zero, Frame(fitted.turn, fitted.origin, found.told.sigma))
+    zero = np.array([found.zero(j) for j in range(found.arm.motors)])
+    return Start(found.start.sense, zero, Frame(found.turn, found.origin, found.told.sigma))
 
 
 def _registered(arm: Arm, start: Start, poses: Poses) -> Posterior:

@@ -69,8 +69,7 @@ class TimeColumn:
 
 def _present(time: FloatArray, values: FloatArray) -> Samples:
     """Return the rows that hold any value."""
-    filled = np.isfinite(values).any(axis=1)
-    return Samples(time[filled], values[filled])
+    return Samples(time, values).take(np.asarray(np.isfinite(values).any(axis=1)))
 
 
 @dataclass(frozen=True)

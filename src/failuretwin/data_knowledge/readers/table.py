@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class Table:
     cells: pd.DataFrame
 
     @classmethod
-    def read(cls, path: Path, separator: str = ",", decimal: str = ".") -> Table:
+    def read(cls, path: Path, separator: str = ",", decimal: str = ".") -> Self:
         """Read a file with a header.
 
         Raises:

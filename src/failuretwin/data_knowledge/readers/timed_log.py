@@ -15,7 +15,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.movements import ROUNDING_RAD, Movements
 from failuretwin.core.polyline import simplify_motors
 from failuretwin.core.runs import AXES, REQUIRED, STEP_S, VARIABLES, RunTable
-from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -43,6 +43,10 @@ class Samples:
     def rate_hz(self) -> float:
         """Typical rate of the samples [Hz]."""
         return float(1.0 / np.median(np.diff(self.time)))
+
+    def take(self, rows: BoolArray | IntArray) -> Samples:
+        """Return some of the samples."""
+        return Samples(self.time[rows], self.value[rows])
 
 
 @dataclass(frozen=True)
@@ -149,7 +153,7 @@ def _distinct(log: TimedLog) -> TimedLog:
     def last(samples: Samples) -> Samples:
         _check_times(samples.time, log.name)
         kept = np.diff(samples.time, append=np.inf) > 0
-        return Samples(samples.time[kept], samples.value[kept])
+        return samples.take(kept)
 
     _check_times(log.command.time, log.name)
     return replace(
