@@ -15,8 +15,7 @@ import numpy as np
 from telling import nats, right
 
 import failuretwin as ft
-from failuretwin.connection.life_history import History
-from failuretwin.connection.tracked_diagnosis import begin, diagnose_tracked
+from failuretwin.connection.tracked_diagnosis import History, begin, diagnose_tracked
 
 FIRST = 10
 """Runs that are told apart: of these the robot is hardly known."""

@@ -23,8 +23,7 @@ from failuretwin.app.shadow import Shadow
 from failuretwin.connection.emulated_arm import FIRST_COMMAND_S, Emulation
 from failuretwin.connection.links.base import CommandSent, Reading
 from failuretwin.connection.links.ros_link import RosSink, RosSource, open_transport
-from failuretwin.connection.links.ros_messages import RosWriter
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_messages import RosTopics, RosWriter
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.monitor import monitor

@@ -25,8 +25,7 @@ from failuretwin.connection.links.replay import (
     session_events,
 )
 from failuretwin.connection.links.ros_link import RosSink, RosSource, open_transport
-from failuretwin.connection.links.ros_messages import RosWriter
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_messages import RosTopics, RosWriter
 from failuretwin.connection.links.ros_transport import RosCodec
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.bag_messages import NS_PER_S

@@ -126,7 +126,7 @@ AREAS: dict[str, tuple[str, ...]] = {
     ),
     "connection/self_calibration.py": ("tests/connection/test_self_calibration.py",),
     "digital_model/arm_classes.py": ("tests/digital_model/test_arm_classes.py",),
-    "connection/life_history.py": ("tests/connection/test_life_history.py",),
+    "connection/tracked_diagnosis.py": ("tests/connection/test_life_history.py",),
     "connection/calibration/step_*.py": ("tests/connection/test_step_fit.py",),
     "connection/calibration/servo_loops.py": ("tests/connection/test_step_fit.py",),
     "connection/calibration": (

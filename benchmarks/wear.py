@@ -15,8 +15,7 @@ import numpy as np
 
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
 from failuretwin.connection.calibration.calibrate import fit_calibration
-from failuretwin.connection.life_history import History
-from failuretwin.connection.tracked_diagnosis import begin, diagnose_tracked
+from failuretwin.connection.tracked_diagnosis import History, begin, diagnose_tracked
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import concatenate
 from failuretwin.core.types import FloatArray, as_floats
@@ -244,9 +243,8 @@ def main() -> None:
     robot = load_robot("armpi_fpv")
     world = World(robot, load_calibration("armpi_fpv", robot).imperfections)
     healthy = Plan(robot, [Hypothesis()], CALIBRATION_RUNS, SEED + 1, world.fresh)
-    learned = fit_calibration(
-        simulate(healthy), robot, "fresh", "simulated", use_readings=False, thorough=False
-    )
+    runs = simulate(healthy).drop_vars("position")
+    learned = fit_calibration(runs, robot, "fresh", "simulated", thorough=False)
     diagnoser = BayesDiagnoser(DigitalTwin(robot), learned.imperfections)
     start = begin(diagnoser, cold=False)
 

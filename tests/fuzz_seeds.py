@@ -15,7 +15,7 @@ import tomli_w
 
 from bag_writers import JOINT_STATE, MONITORING, POINT, TRAJECTORY, entry, time_of, write_bag
 from failuretwin import load_robot, read_runs
-from failuretwin.connection.links.ros_topics import load_topics
+from failuretwin.connection.links.ros_messages import load_topics
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.hypothesis import parse_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate

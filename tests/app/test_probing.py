@@ -12,8 +12,7 @@ import pytest
 
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.links.base import OK, Answer, CommandSent, LinkCounts, Order, Reading
-from failuretwin.connection.links.ros_messages import RosWriter
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_messages import RosTopics, RosWriter
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import (
     ALL_CLEAR,

@@ -12,8 +12,7 @@ from failuretwin.app import shadow as shadow_module
 from failuretwin.app.live import View, watch_until_end
 from failuretwin.app.shadow import Changes, Shadow
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, LinkCounts, Reading
-from failuretwin.connection.links.ros_messages import SampledCommands
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_messages import RosTopics, SampledCommands
 from failuretwin.core.hypothesis import (
     ALL_CLEAR,
     CLEAR,

@@ -21,8 +21,8 @@ import failuretwin as ft
 from failuretwin.app.remembering import RobotRecord
 from failuretwin.app.shadow import Change, Snapshot
 from failuretwin.app.watch_keeper import begin_watch
-from failuretwin.connection.life_history import read_rows
 from failuretwin.connection.links.base import OK, Answer
+from failuretwin.connection.tracked_diagnosis import read_rows
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import ALL_CLEAR, RAISED, Alarm
 from failuretwin.data_knowledge.records.rows import Basis

@@ -14,7 +14,12 @@ import numpy as np
 import pytest
 from worn_robot import CALIBRATION, life, seen, truth
 
-from failuretwin.connection.life_history import History, history_path, keep_history, open_history
+from failuretwin.connection.tracked_diagnosis import (
+    History,
+    history_path,
+    keep_history,
+    open_history,
+)
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.inference.together.wear_limits import WearLimits
 from full_disks import full_disk

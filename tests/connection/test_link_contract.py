@@ -19,7 +19,7 @@ from failuretwin.connection.links.replay import Pace, replay
 from failuretwin.connection.links.ros1 import Ros1Transport, message_class
 from failuretwin.connection.links.ros2 import Ros2Transport
 from failuretwin.connection.links.ros_link import RosSource
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.connection.links.ros_transport import Outgoing, RosCodec
 from failuretwin.connection.links.rosbridge import RosbridgeTransport
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS

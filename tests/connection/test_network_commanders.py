@@ -11,7 +11,7 @@ import pytest
 from failuretwin.connection.links import ros_transport
 from failuretwin.connection.links.base import CommandSent, Order, Reading
 from failuretwin.connection.links.ros_link import RosCommander, is_network, open_transport
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.connection.links.ros_transport import Transport
 from failuretwin.core.errors import InputError
 from fake_rosbridge import FakeRosbridge

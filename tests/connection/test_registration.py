@@ -5,8 +5,8 @@ import pytest
 from dh_arms import UR5, forward, robot_in, urdf
 from scipy.spatial.transform import Rotation
 
+from failuretwin.connection.registration.arm import Poses
 from failuretwin.connection.registration.fit import register
-from failuretwin.connection.registration.poses import Poses
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.robot import _assembled
 

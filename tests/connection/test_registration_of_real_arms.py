@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from dh_arms import UR5, UR10, robot_in, urdf
 
+from failuretwin.connection.registration.arm import Poses
 from failuretwin.connection.registration.fit import register
-from failuretwin.connection.registration.poses import Poses
 from failuretwin.digital_model.robot import _assembled
 
 ARMS = {"ur10_series_c": UR10, "ur5": UR5}

@@ -15,8 +15,7 @@ from failuretwin.connection.links import ros_messages
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, Reading
 from failuretwin.connection.links.ros1 import Ros1Transport
 from failuretwin.connection.links.ros_link import RosSink, RosSource
-from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosWriter
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosTopics, RosWriter
 from failuretwin.core.hypothesis import ALL_CLEAR, RAISED, Alarm, Diagnosis, Episode
 from little_logs import LOG_COLUMNS
 from ros_peer import RosPeer

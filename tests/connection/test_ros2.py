@@ -11,8 +11,7 @@ import pytest
 from failuretwin.connection.links.base import OK, Answer, CommandSent, Reading
 from failuretwin.connection.links.ros2 import Ros2Transport, domain_id
 from failuretwin.connection.links.ros_link import RosSink, RosSource
-from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosWriter
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosTopics, RosWriter
 from failuretwin.connection.links.ros_transport import RosCodec
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis

@@ -11,8 +11,7 @@ import pytest
 from failuretwin.connection.links import ros_messages, rosbridge
 from failuretwin.connection.links.base import OK, Answer
 from failuretwin.connection.links.ros_link import RosSink, RosSource
-from failuretwin.connection.links.ros_messages import DiagnosticsWriter
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosTopics
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from roscores import free_port

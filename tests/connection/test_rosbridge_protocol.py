@@ -18,8 +18,7 @@ import pytest
 
 from failuretwin.connection.links.base import OK, Answer, CommandSent, Order, Reading
 from failuretwin.connection.links.ros_link import RosCommander, RosSink, RosSource
-from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosWriter
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosTopics, RosWriter
 from failuretwin.core.hypothesis import Diagnosis
 from waiting import WAIT_S, wait_for
 

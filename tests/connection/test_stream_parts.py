@@ -25,8 +25,7 @@ from failuretwin.connection.links.base import (
     source_from_text,
 )
 from failuretwin.connection.links.replay import Pace
-from failuretwin.connection.links.ros_messages import DiagnosticsWriter
-from failuretwin.connection.links.ros_topics import RosTopics, load_topics
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosTopics, load_topics
 from failuretwin.connection.links.statuses import (
     LEVEL_ERROR,
     LEVEL_OK,

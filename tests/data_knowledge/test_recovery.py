@@ -11,7 +11,8 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
-from failuretwin.data_knowledge.ramp_fit import PathPart, fit
+from failuretwin.data_knowledge.ramp_fit import fit
+from failuretwin.data_knowledge.readers.timed_log import Samples
 from failuretwin.data_knowledge.recovery import published_time_bases, recover_movements
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
@@ -277,7 +278,7 @@ def test_fit_of_a_ramp_finds_all_that_is_free(twin):
     ramp, start = np.array([[[0.6, 0.8, 1.0, 0.7]]]), np.array([[0.2]])
     wanted = Movements(initial, target[:, None], ramp, start)
     time = np.linspace(0.0, 1.5, 60)
-    part = PathPart(time, twin.path(wanted.reference(time))[0])
+    part = Samples(time, twin.path(wanted.reference(time))[0])
     guess = Movements(initial, wanted.target + 0.01, ramp + 0.02, start + 0.01)
     found = fit(guess, part, twin, np.repeat([False, True, True], 4), steps=60)
     np.testing.assert_allclose(found.target, wanted.target, atol=1e-9)

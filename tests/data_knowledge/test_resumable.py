@@ -17,14 +17,10 @@ import xarray as xr
 from failuretwin import read_runs
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge import pieces, resumable
+from failuretwin.data_knowledge import pieces
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.pieces import versions
-from failuretwin.data_knowledge.resumable import (
-    UnfinishedRunSet,
-    make_chunk,
-    produce,
-)
+from failuretwin.data_knowledge.resumable import UnfinishedRunSet, produce
 from failuretwin.data_knowledge.store import load_run_set, save_run_set, sole_writer
 from failuretwin.data_knowledge.workers import ONE_PROCESS
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -33,6 +29,7 @@ RUNS_PER_CLASS = 2
 PIECE = 4
 PIECES = 5
 """18 runs in pieces of four."""
+MAKE = UnfinishedRunSet.make
 
 
 @pytest.fixture(scope="module", params=["none", "armpi_fpv"])
@@ -64,10 +61,10 @@ def cut_short(plan, path, pieces, monkeypatch, error=KeyboardInterrupt):
         if len(made) == pieces:
             raise error
         made.append(piece)
-        return make_chunk(job, piece)
+        return MAKE(job, piece)
 
     with monkeypatch.context() as patch:
-        patch.setattr(resumable, "make_chunk", failing)
+        patch.setattr(UnfinishedRunSet, "make", failing)
         with pytest.raises(OutputError if error is OSError else error):
             produce(plan, path, tell=told.append, chunk_runs=PIECE)
     return told
@@ -79,9 +76,9 @@ def counting(monkeypatch):
 
     def counted(job, piece):
         made.append(piece)
-        return make_chunk(job, piece)
+        return MAKE(job, piece)
 
-    monkeypatch.setattr(resumable, "make_chunk", counted)
+    monkeypatch.setattr(UnfinishedRunSet, "make", counted)
     return made
 
 
@@ -210,9 +207,9 @@ def test_the_old_run_set_stands_until_the_new_one_does(monkeypatch, imperfect, o
 
     def watching(job, piece):
         seen.append(contents(old) == before)
-        return make_chunk(job, piece)
+        return MAKE(job, piece)
 
-    monkeypatch.setattr(resumable, "make_chunk", watching)
+    monkeypatch.setattr(UnfinishedRunSet, "make", watching)
     produce(imperfect, old, chunk_runs=PIECE)
     assert seen == [True] * PIECES
     xr.testing.assert_identical(load_run_set(old), simulate(imperfect))
@@ -305,14 +302,14 @@ def test_worker_with_other_versions_is_refused(tmp_path, imperfect):
     job = started(imperfect, tmp_path)
     other = replace(job, versions={**job.versions, "numpy": "1.0"})
     with pytest.raises(InputError, match=r"expected .*numpy 1\.0.* Install the same versions"):
-        make_chunk(other, 0)
+        other.make(0)
 
 
 def test_worker_that_does_not_share_the_folder_is_refused(tmp_path, imperfect):
     job = started(imperfect, tmp_path)
     job.remove()
     with pytest.raises(InputError, match=r"sees no .* that all workers share"):
-        make_chunk(job, 0)
+        job.make(0)
     assert listing(tmp_path) == []
 
 
@@ -322,7 +319,7 @@ from pathlib import Path
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.generate import Plan
-from failuretwin.data_knowledge.resumable import make_chunk, produce
+from failuretwin.data_knowledge.resumable import produce
 produce(Plan(load_robot("armpi_fpv"), [Hypothesis()], int(sys.argv[2])), Path(sys.argv[1]))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
@@ -349,7 +346,7 @@ from pathlib import Path
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan
-from failuretwin.data_knowledge.resumable import make_chunk, produce
+from failuretwin.data_knowledge.resumable import produce
 from failuretwin.digital_model.calibrated_robot import load_calibration
 robot = load_robot("armpi_fpv")
 known = load_calibration("armpi_fpv", robot).imperfections

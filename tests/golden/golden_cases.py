@@ -251,14 +251,8 @@ def separated(runs, hypotheses=None):
 
 def calibrated(use_readings, thorough):
     """Return what healthy runs teach, every figure by its name."""
-    found = fit_calibration(
-        load("sessions"),
-        twin().robot,
-        "golden",
-        "stored runs",
-        use_readings=use_readings,
-        thorough=thorough,
-    )
+    runs = load("sessions") if use_readings else load("sessions").drop_vars("position")
+    found = fit_calibration(runs, twin().robot, "golden", "stored runs", thorough=thorough)
     return {
         "figures": {
             f"{p.name} {p.motor}".strip(): [p.value, p.low, p.high, p.identified]

@@ -24,8 +24,7 @@ from failuretwin.connection.links.ros_link import (
     is_network,
     open_transport,
 )
-from failuretwin.connection.links.ros_messages import DiagnosticsWriter
-from failuretwin.connection.links.ros_topics import RosTopics, load_topics
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosTopics, load_topics
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray

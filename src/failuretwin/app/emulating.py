@@ -21,8 +21,7 @@ from failuretwin.connection.links.ros_link import (
     is_network,
     open_transport,
 )
-from failuretwin.connection.links.ros_messages import RosWriter
-from failuretwin.connection.links.ros_topics import load_topics
+from failuretwin.connection.links.ros_messages import RosWriter, load_topics
 from failuretwin.core.errors import InputError
 from failuretwin.failure_behavior.injection import ScheduledFault, state_at
 

@@ -13,13 +13,15 @@ from failuretwin.app.reports.calibration_report import taught_section, tracking_
 from failuretwin.app.reports.technician_page import Section
 from failuretwin.app.terminal import progress_bar
 from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
-from failuretwin.connection.life_history import History, keep_history, open_history
 from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser, learned_name
 from failuretwin.connection.tracked_diagnosis import (
+    History,
     Tracked,
     begin,
     calibration_of,
     diagnose_tracked,
+    keep_history,
+    open_history,
 )
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis

@@ -19,7 +19,7 @@ import numpy as np
 from failuretwin.app.remembering import RobotRecord
 from failuretwin.app.terminal import tell
 from failuretwin.connection.calibration.result import SETTLING_UNITS
-from failuretwin.connection.life_history import History, start_of
+from failuretwin.connection.tracked_diagnosis import History, start_of
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.data_knowledge.records.beliefs import Belief, BeliefLine
 from failuretwin.data_knowledge.records.offsets import MotorOffset

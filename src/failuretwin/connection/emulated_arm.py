@@ -193,9 +193,7 @@ class EmulatedArm(PacedSource):
     def _begin(self, order: Order, sent_s: float | None) -> CommandSent:
         """Begin an order, with its disturbances and faults; return it as it was sent.
 
-        Args:
-            order: The order.
-            sent_s: When the operator sent it [s]; None: it is another's, which is sent now.
+        `sent_s` is when the operator sent it [s]; None: it is another's, which is sent now.
         """
         now, drawn, self._upcoming = self._now, self._upcoming, self._draw()
         movement = Movements(

@@ -96,10 +96,7 @@ class LearnedRates:
     ) -> LearnedRates:
         """Return the rates of the single faults among some hypotheses.
 
-        Args:
-            seen: Confirmed faults of a kind of robot.
-            hypotheses: The hypotheses.
-            ages: Age of each motor [h]; of others all ages count.
+        `ages` are those of motors [h]; of others all ages count.
         """
         rates = []
         for name, per_h in table_rates(hypotheses).items():

@@ -13,21 +13,18 @@ Section: docs/reading_logs.md#joint-offsets
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp, softmax
 
 from failuretwin.core.hypothesis import SURE, Interval
+from failuretwin.core.runs import RunSet
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, sag
 from failuretwin.failure_behavior.modes import EncoderBias
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 STILL_RAD, STILL_S = 3.5e-3, 0.3
 """Joints stand still if they turn through no more in this time: about 0.2 deg [rad, s]."""
@@ -75,24 +72,11 @@ class JointOffset:
         return self.steady and self.probability >= SURE
 
 
-class _Stops(NamedTuple):
-    """Stops of one joint: rows of the run set (run, time) and direction of the travel before."""
-
-    run: list[int]
-    row: list[int]
-    direction: list[float]
-    error: list[float]
-
-
-def joint_offsets(runs: xr.Dataset, robot: Robot, known: Imperfections) -> tuple[JointOffset, ...]:
+def joint_offsets(runs: RunSet, robot: Robot, known: Imperfections) -> tuple[JointOffset, ...]:
     """Return the offset of each joint that follows its commands and stops often enough.
 
-    A stuck motor does not follow, so it has none.
-
-    Args:
-        runs: Runs with `command` and `position`, of one robot.
-        robot: The robot.
-        known: Its healthy behaviour; without settled errors or their variation, its class counts.
+    A stuck motor does not follow, so it has none. Runs have `command` and `position`. Where the
+    known healthy behaviour lacks settled errors or their variation, the arm's class counts.
     """
     if known.settling is None or known.variation is None or not known.variation.bias:
         known = generic_imperfections(robot)
@@ -104,19 +88,26 @@ def joint_offsets(runs: xr.Dataset, robot: Robot, known: Imperfections) -> tuple
     found = []
     for k, motor in enumerate(robot.motor_names):
         stops = _stops(command[..., k], position[..., k], time)
-        at = command[stops.run, stops.row]
-        errors = np.array(stops.error)
-        if len(at) < FEWEST_STOPS or errors.std() > FOLLOWS * at[:, k].std():
+        if len(stops) < FEWEST_STOPS:
+            continue
+        run, row, direction, errors = map(np.array, zip(*stops, strict=True))
+        at = command[run, row]
+        if errors.std() > FOLLOWS * at[:, k].std():
             continue
         load = sag(robot, at, np.asarray(settling.compliance), settling.payload)[:, k]
-        rows = np.stack([np.ones(len(at)), -np.array(stops.direction), load], axis=1)
+        rows = np.stack([np.ones(len(at)), -direction, load], axis=1)
         found.append(_offset(motor, k, errors, rows, settling, variation))
     return tuple(found)
 
 
-def _stops(command: FloatArray, position: FloatArray, time: FloatArray) -> _Stops:
-    """Return the stops of one joint, of commands and readings (run, time) [rad]."""
-    found = _Stops([], [], [], [])
+def _stops(
+    command: FloatArray, position: FloatArray, time: FloatArray
+) -> list[tuple[int, int, float, float]]:
+    """Return run, row, direction of the travel before and error [rad] of each stop of one joint.
+
+    Commands and readings are (run, time) [rad].
+    """
+    found = []
     for run, (asked, seen) in enumerate(zip(command, position, strict=True)):
         rows = np.flatnonzero(np.isfinite(seen))
         last: float | None = None
@@ -128,10 +119,9 @@ def _stops(command: FloatArray, position: FloatArray, time: FloatArray) -> _Stop
             if last is not None and abs(here - last) < TRAVEL_RAD:
                 continue
             last = here
-            found.run.append(run)
-            found.row.append(int(settled[0]))
-            found.direction.append(float(np.sign(here - before[far[-1]])) if len(far) else 0.0)
-            found.error.append(float(np.median(seen[settled] - asked[settled])))
+            direction = float(np.sign(here - before[far[-1]])) if len(far) else 0.0
+            error = float(np.median(seen[settled] - asked[settled]))
+            found.append((run, int(settled[0]), direction, error))
     return found
 
 

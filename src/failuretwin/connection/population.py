@@ -319,10 +319,7 @@ def stated_variation(
 ) -> Variation:
     """Return deviations as a calibration states them: of compliance as a share, 1 at most.
 
-    Args:
-        deviation: Of bias, compliance and friction, (3 motor,) or (3, motor).
-        settling: Where motors settle.
-        others: All other deviations; None: none.
+    `deviation` is of bias, compliance and friction, (3 motor,) or (3, motor), `others` all others.
     """
     bias, compliance, friction = deviation.reshape(3, -1)
     mean = np.abs(np.asarray(settling.compliance))

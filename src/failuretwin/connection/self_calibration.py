@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from failuretwin.connection.calibration.observations import session_names
@@ -25,7 +24,7 @@ from failuretwin.core.errors import InputError, counted
 from failuretwin.core.foreign import check_memory
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.movements import Movements
-from failuretwin.core.runs import check_motors, truths_of
+from failuretwin.core.runs import RunSet, check_motors, truths_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.digital_model.arm_classes import generic_imperfections
@@ -193,7 +192,7 @@ class SelfCalibratingDiagnoser:
         prior = np.exp(log_prior(bayes.hypothesis_set, bayes.priors))
         return SelfCalibration(diagnoses, learned, prior, found.taught)
 
-    def _population(self, runs: xr.Dataset, movements: Movements) -> Imperfections:
+    def _population(self, runs: RunSet, movements: Movements) -> Imperfections:
         """Return what such robots are like, with what the commands alone say of their timing."""
         robot = self.twin.robot
         believed = calibrated(self.robot, self._figures or generic_imperfections(robot))
@@ -225,18 +224,14 @@ def check_moves(movements: Movements) -> None:
 
 
 def with_timing_of(
-    known: Imperfections, movements: Movements, robot: Robot, runs: xr.Dataset | None = None
+    known: Imperfections, movements: Movements, robot: Robot, runs: RunSet | None = None
 ) -> Imperfections:
     """Return imperfections with the late starts and the schedule that commands tell.
 
-    Args:
-        known: What is believed of the robot otherwise.
-        movements: Movements as they were commanded.
-        robot: The robot.
-        runs: Their runs, which tell when readings stop before a late start; None: not known.
+    The runs tell when readings stop before a late start.
     """
     late = lateness(movements)
-    gaps = np.zeros(0) if runs is None else gap_starts(runs, movements, late.late)
+    gaps = np.zeros(0) if runs is None else gap_starts(runs, movements, late)
     schedule = schedule_of(movements, late, robot)
     return replace(known, timing=timing_of(None, late, gaps), schedule=schedule)
 
@@ -247,16 +242,9 @@ def more_when_late(entry: LostCommand) -> LostCommand:
 
 
 def as_calibration(
-    found: FolderPosterior, believed: Imperfections, robot: Robot, runs: xr.Dataset
+    found: FolderPosterior, believed: Imperfections, robot: Robot, runs: RunSet
 ) -> Calibration:
-    """Return what was learned as a calibration, which anybody may use.
-
-    Args:
-        found: What runs say together.
-        believed: What was believed before.
-        robot: The robot.
-        runs: The runs.
-    """
+    """Return what was learned as a calibration, which anybody may use."""
     learned = found.model.imperfections
     source = f"{counted(runs.sizes['run'], 'run')} without labels; {believed.name}"
     parameters = _parameters(found, believed, robot)
@@ -280,7 +268,7 @@ def as_calibration(
     )
 
 
-def _readings(model: HealthyModel, runs: xr.Dataset) -> Readings:
+def _readings(model: HealthyModel, runs: RunSet) -> Readings:
     """Return how the sensor sampled the runs, with its noise where nobody had measured it."""
     found = readings_of(runs, model.twin.robot, None)
     return found if model.knows_noise else replace(found, noise_m=model.path_noise)
@@ -335,9 +323,7 @@ def _parameters(found: FolderPosterior, believed: Imperfections, robot: Robot) -
     return told
 
 
-def _remarks(
-    parameters: Sequence[Parameter], found: FolderPosterior, runs: xr.Dataset
-) -> list[str]:
+def _remarks(parameters: Sequence[Parameter], found: FolderPosterior, runs: RunSet) -> list[str]:
     """Return what else is to be known of what was learned."""
     lines = [
         f"{p.name} of {p.motor}: {p.note}: {ODD[p.name]}"

@@ -56,66 +56,58 @@ class StudentFit:
 
 
 def fit_student(residual: Residual, begin: FloatArray, dims: int) -> StudentFit:
-    """Return the unknowns fitted to rows.
+    """Return the unknowns fitted to rows, from `begin` (unknown,).
 
-    Args:
-        residual: The model.
-        begin: Unknowns to begin at, (unknown,).
-        dims: n, the dimensions in which residuals can differ; channels may be more.
+    `dims` is n, the dimensions in which residuals can differ; channels may be more.
     """
-    x, scatter = begin, _Scatter(dims)
-    sigma = scatter.sigma(residual(x), np.inf)
+    x, sigma = begin, _sigma(residual(begin), np.inf, dims)
     for _ in range(SIGMA_ROUNDS):
-        x = scatter.mode(residual, x, sigma)
-        before, sigma = sigma, scatter.sigma(residual(x), sigma)
+        x = _mode(residual, x, sigma, dims)
+        before, sigma = sigma, _sigma(residual(x), sigma, dims)
         if abs(sigma - before) < SETTLED * sigma:
             break
     r, J = residual(x), _jacobian(residual, x)
     freedom = float(dims * len(r))
     size = np.linalg.svd(J / sigma, compute_uv=False) ** 2
     lost = min(float(np.sum(size / (1.0 + size))), 0.9 * freedom)  # told by rows, not by the prior
-    noise = scatter.effective(r, sigma) * float(np.sqrt(freedom / (freedom - lost)))
+    noise = _effective(r, sigma, dims) * float(np.sqrt(freedom / (freedom - lost)))
     covariance = as_floats(np.linalg.inv(J.T @ J / noise**2 + np.eye(len(x))))
     density = log_student(r, np.zeros((*r.shape, 1)), sigma**2, DOF)
     return StudentFit(x, covariance, sigma, noise, float(density.sum()))
 
 
-@dataclass(frozen=True)
-class _Scatter:
-    """The Student t of residuals in some dimensions."""
+def _mode(residual: Residual, x: FloatArray, sigma: float, dims: int) -> FloatArray:
+    """Return the mode: the log density of a row as a square, with the prior beside it."""
 
-    dims: int
+    def terms(x: FloatArray) -> FloatArray:
+        r = residual(x)
+        square = np.maximum(np.einsum("ia,ia->i", r, r) / sigma**2, 1e-30)
+        shrunk = np.sqrt((DOF + dims) * np.log1p(square / DOF) / square) / sigma
+        return np.concatenate([(r * shrunk[:, None]).ravel(), x])
 
-    def mode(self, residual: Residual, x: FloatArray, sigma: float) -> FloatArray:
-        """Return the mode: the log density of a row as a square, with the prior beside it."""
+    return np.asarray(least_squares(terms, x, method="lm", max_nfev=40 * (len(x) + 1)).x)
 
-        def terms(x: FloatArray) -> FloatArray:
-            r = residual(x)
-            square = np.maximum(np.einsum("ia,ia->i", r, r) / sigma**2, 1e-30)
-            shrunk = np.sqrt((DOF + self.dims) * np.log1p(square / DOF) / square) / sigma
-            return np.concatenate([(r * shrunk[:, None]).ravel(), x])
 
-        return np.asarray(least_squares(terms, x, method="lm", max_nfev=40 * (len(x) + 1)).x)
+def _sigma(r: FloatArray, sigma: float, dims: int) -> float:
+    """Return the scatter at which its likelihood is greatest, from that before."""
+    square = np.einsum("ia,ia->i", r, r)
+    if np.isinf(sigma):
+        sigma = float(np.sqrt(np.median(square) / chi2.median(dims)))
+    for _ in range(30):
+        sigma = max(sigma, LEAST_SIGMA)
+        weight = (DOF + dims) / (DOF + square / sigma**2)
+        sigma = float(np.sqrt(np.mean(weight * square) / dims))
+    return max(sigma, LEAST_SIGMA)
 
-    def sigma(self, r: FloatArray, sigma: float) -> float:
-        """Return the scatter at which its likelihood is greatest, from that before."""
-        square = np.einsum("ia,ia->i", r, r)
-        if np.isinf(sigma):
-            sigma = float(np.sqrt(np.median(square) / chi2.median(self.dims)))
-        for _ in range(30):
-            sigma = max(sigma, LEAST_SIGMA)
-            weight = (DOF + self.dims) / (DOF + square / sigma**2)
-            sigma = float(np.sqrt(np.mean(weight * square) / self.dims))
-        return max(sigma, LEAST_SIGMA)
 
-    def effective(self, r: FloatArray, sigma: float) -> float:
-        """Return B^1/2 / A."""
-        square = np.einsum("ia,ia->i", r, r)
-        d = square / sigma**2
-        weight = (DOF + self.dims) / (DOF + d)
-        slope = float(np.mean(weight * (1.0 - 2.0 * d / (self.dims * (DOF + d)))))
-        middle = float(np.sqrt(np.mean(weight**2 * square) / self.dims))
-        return max(middle / slope, LEAST_SIGMA)
+def _effective(r: FloatArray, sigma: float, dims: int) -> float:
+    """Return B^1/2 / A."""
+    square = np.einsum("ia,ia->i", r, r)
+    d = square / sigma**2
+    weight = (DOF + dims) / (DOF + d)
+    slope = float(np.mean(weight * (1.0 - 2.0 * d / (dims * (DOF + d)))))
+    middle = float(np.sqrt(np.mean(weight**2 * square) / dims))
+    return max(middle / slope, LEAST_SIGMA)
 
 
 def _jacobian(residual: Residual, x: FloatArray) -> FloatArray:

@@ -1,21 +1,28 @@
 """Diagnosis that learns as it goes: runs are judged in their order, each by those before it.
 
-Section: docs/inference.md#lives
+The history of a robot's life is a line a run for people, and beside it what is believed now.
+``CAL.history.jsonl`` holds a head, which says of which robot and prior it is, and a line a run;
+``CAL.history.npz`` the state from which the next command goes on, digit for digit. The state says
+how much of the lines counts, so that a writer that is killed between the two does no harm.
+
+Sections: docs/inference.md#lives, docs/self_calibration.md#follow-the-life-of-a-robot
 """
 
 from __future__ import annotations
 
 import copy
 import hashlib
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from failuretwin.connection.calibration.observations import session_names
 from failuretwin.connection.calibration.result import Calibration
-from failuretwin.connection.life_history import History
 from failuretwin.connection.population import stated_variation
 from failuretwin.connection.self_calibration import (
     as_calibration,
@@ -23,10 +30,14 @@ from failuretwin.connection.self_calibration import (
     more_when_late,
     with_timing_of,
 )
-from failuretwin.core.errors import InputError
+from failuretwin.core.config import fingerprint
+from failuretwin.core.errors import InputError, OutputError
+from failuretwin.core.foreign import read_text, reading
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.core.runs import check_motors, truths_of
+from failuretwin.core.runs import RunSet, check_motors, truths_of
 from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.data_knowledge.readers.file_claims import check_npz
+from failuretwin.data_knowledge.store import check_writable, replacing
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.inference.diagnoser import BayesDiagnoser
@@ -37,14 +48,33 @@ from failuretwin.inference.together.life_filter import LifeFilter
 from failuretwin.inference.together.mixed_runs import of_second_robot, two_robots
 from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
 
-if TYPE_CHECKING:
-    import xarray as xr
-
 BATCH, SHARE = 10, 4
 """Runs that are judged with the same belief at most, and how many runs must have come for each:
 among the first ones every run counts for the next."""
 KEY_DIGITS = 16
 OFFSETS = ("bias", "compliance", "friction")
+LINES, STATE = ".history.jsonl", ".history.npz"
+SIZE = "size"
+"""Name in the state of how many bytes of the lines count."""
+
+
+@dataclass(frozen=True)
+class History:
+    """What has been seen of a robot before.
+
+    Attributes:
+        life: What is believed of it.
+        cold: Whether it began with nothing but what its kind is like.
+        path: File of the lines; None: nothing is kept.
+        size: Bytes of it that count.
+        keys: Fingerprints of the runs so far.
+    """
+
+    life: LifeFilter
+    cold: bool
+    path: Path | None = None
+    size: int = 0
+    keys: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -71,10 +101,7 @@ class Tracked:
 def begin(diagnoser: BayesDiagnoser, cold: bool, limits: WearLimits | None = None) -> LifeFilter:
     """Return what is believed of a robot before any run.
 
-    Args:
-        diagnoser: A diagnoser with its hypotheses; it uses the calibration, unless it is cold.
-        cold: Whether nothing is known of this robot but its kind.
-        limits: How fast and how far it may change; None: as usual.
+    That is what its calibration says, or, if it begins cold, what robots of its kind are like.
 
     Raises:
         InputError: If it is not said where motors settle, or no hypothesis says where they do.
@@ -104,18 +131,14 @@ def begin(diagnoser: BayesDiagnoser, cold: bool, limits: WearLimits | None = Non
 
 
 def diagnose_tracked(
-    runs: xr.Dataset,
+    runs: RunSet,
     diagnoser: BayesDiagnoser,
     history: History,
     advance: Callable[[int], None] = lambda done: None,
 ) -> Tracked:
-    """Diagnose runs in their order, each by what those before it teach; writes nothing.
+    """Diagnose runs, oldest first, each by what those before it teach; writes nothing.
 
-    Args:
-        runs: The runs, oldest first.
-        diagnoser: How to diagnose.
-        history: What has been seen before.
-        advance: Called with the number of runs just diagnosed.
+    `advance` is called with the number of runs just diagnosed.
 
     Raises:
         InputError: If no run holds a movement, or they are of another robot.
@@ -123,7 +146,8 @@ def diagnose_tracked(
     robot = diagnoser.twin.robot
     check_motors(runs, robot.name, robot.motor_names)
     life, known = copy.deepcopy(history.life), set(history.keys)
-    seen = _Seen.of(runs, diagnoser, life)
+    seen = _Seen(runs, diagnoser, Evidence(runs, life.model.settings))
+    check_moves(seen.evidence.movements)
     diagnoses: list[Diagnosis | None] = [None] * len(seen.names)
     rows: list[dict[str, Any]] = []
     mixed = ""
@@ -159,7 +183,7 @@ def _mixed(life: LifeFilter, rows: list[dict[str, Any]]) -> str:
 
 
 def _batches(
-    runs: xr.Dataset, keys: list[str], known: set[str], cold: bool, life: LifeFilter
+    runs: RunSet, keys: list[str], known: set[str], cold: bool, life: LifeFilter
 ) -> Iterator[IntArray]:
     """Yield the runs that are new, in their order, some of one session at a time."""
     sessions, batch = session_names(runs), list[int]()
@@ -211,20 +235,16 @@ class _Seen:
         runs: The runs.
         diagnoser: How to diagnose.
         seen: What they say.
-        evidence: Settled positions.
     """
 
-    runs: xr.Dataset
+    runs: RunSet
     diagnoser: BayesDiagnoser
     seen: Evidence
-    evidence: SettledEvidence
 
-    @classmethod
-    def of(cls, runs: xr.Dataset, diagnoser: BayesDiagnoser, life: LifeFilter) -> _Seen:
-        seen = Evidence(runs, life.model.settings)
-        evidence = seen.sound.settled
-        check_moves(evidence.movements)
-        return cls(runs, diagnoser, seen, evidence)
+    @cached_property
+    def evidence(self) -> SettledEvidence:
+        """Settled positions."""
+        return self.seen.sound.settled
 
     @property
     def names(self) -> list[str]:
@@ -268,15 +288,120 @@ class _Seen:
         return with_timing_of(now, movements, self.diagnoser.twin.robot)
 
 
-def calibration_of(life: LifeFilter, runs: xr.Dataset) -> Calibration:
-    """Return what a life has taught as a calibration, which anybody may use.
-
-    Args:
-        life: What is believed of the robot.
-        runs: Its latest runs.
-    """
+def calibration_of(life: LifeFilter, runs: RunSet) -> Calibration:
+    """Return what a life has taught by its latest runs, as a calibration that anybody may use."""
     robot, found = life.model.twin.robot, life.told
     told = as_calibration(found, life.begun, robot, runs)
     source = f"{life.arrived} runs without labels; {life.begun.name}"
     known = replace(told.imperfections, source=source)
     return replace(told, imperfections=known, runs=life.arrived, movements=life.movements)
+
+
+# The files of a history.
+
+
+def history_path(calibration: Path) -> Path:
+    """Return where the history of a calibration is kept: CAL.history.jsonl beside CAL.toml."""
+    return calibration.with_suffix(LINES)
+
+
+def open_history(calibration: Path, start: LifeFilter, cold: bool) -> History:
+    """Return the history beside a calibration; where there is none, it begins with `start`.
+
+    `start` is the belief before any run; a cold one is what robots of its kind are like.
+
+    Raises:
+        InputError: If the history cannot be read, is damaged, or has begun with something else.
+        OutputError: If a history cannot be written there.
+    """
+    path = history_path(calibration)
+    state = path.with_suffix("").with_suffix(STATE)
+    check_writable(path)
+    if not (path.exists() and state.exists()):
+        return History(start, cold, path)
+    with reading(path, "a history", f"It is damaged: move it and {state} away."):
+        content = path.read_bytes()
+        check_npz(state)
+        with np.load(state, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        size = int(arrays.pop(SIZE))
+        if len(content) < size:
+            raise InputError(f"{path}: is shorter than it was. Move it and {state} away.")
+        lines = content[:size].decode().splitlines()
+        rows = [_object(line, f"{path}: line {n}") for n, line in enumerate(lines, start=1)]
+        _check_head(rows[0], path, start)
+        return History(start.resumed(arrays), cold, path, size, tuple(r["key"] for r in rows[1:]))
+
+
+def read_rows(path: Path, robot: str) -> list[dict[str, Any]]:
+    """Return the lines of a robot's history, one a run, as `keep_history` was given them.
+
+    Raises:
+        InputError: If it cannot be read, is damaged, is of another robot, or holds no run.
+    """
+    text = read_text(path, "a history")
+    rows = [_object(line, f"{path}: line {n}") for n, line in enumerate(text.splitlines(), start=1)]
+    of = rows[0].get("history_of") if rows else None
+    if of != robot:
+        raise InputError(f"{path}: is the history of {of or 'no robot'}, expected {robot!r}.")
+    if not rows[1:]:
+        raise InputError(f"{path}: holds no run. Expected what `diagnose --track` keeps.")
+    return rows[1:]
+
+
+def keep_history(history: History, life: LifeFilter, rows: Sequence[dict[str, Any]]) -> None:
+    """Add runs to the files that `history` was read from, and what is believed after them.
+
+    Raises:
+        OutputError: If that cannot be done, or the files have changed since; they are as before.
+    """
+    path = history.path
+    if path is None or not rows:
+        return
+    state = path.with_suffix("").with_suffix(STATE)
+    if _counted(state) != history.size:
+        raise OutputError(
+            f"{path}: has changed since it was read; another diagnosis tracks with the same "
+            "calibration. It is as that one left it; run the command again."
+        )
+    lines = [start_of(history.life)] if history.size == 0 else []
+    text = "".join(f"{json.dumps(line)}\n" for line in [*lines, *rows]).encode()
+    before = path.read_bytes()[: history.size] if history.size else b""
+    with replacing(path) as partial:
+        partial.write_bytes(before + text)
+    with replacing(state) as partial, partial.open("wb") as file:
+        size = np.array(history.size + len(text))
+        np.savez(file, allow_pickle=False, **{SIZE: size, **life.to_arrays()})
+
+
+def _counted(state: Path) -> int:
+    """Return how many bytes of the lines count now."""
+    if not state.exists():
+        return 0
+    with np.load(state, allow_pickle=False) as stored:
+        return int(stored[SIZE])
+
+
+def start_of(life: LifeFilter) -> dict[str, Any]:
+    """Return which robot, which prior and which limits a history is of."""
+    given = life.begun
+    known = [given.settling, given.variation, life.limits]
+    return {"history_of": life.model.twin.robot.name, "calibration": fingerprint(known)}
+
+
+def _check_head(head: dict[str, Any], path: Path, start: LifeFilter) -> None:
+    if "history_of" not in head or "calibration" not in head:
+        raise InputError(f"{path}: is no history of a calibration. Move it away.")
+    if head != start_of(start):
+        raise InputError(
+            f"{path}: is the history of another calibration (of robot {head['history_of']!r}); the "
+            "one beside it has been learned again since. Move the history away to begin a new one."
+        )
+
+
+def _object(line: str, where: str) -> dict[str, Any]:
+    with reading(where, "JSON", "It is damaged: move the file away."):
+        value = json.loads(line)
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: is damaged (no object). Move the file away.")
+    return value

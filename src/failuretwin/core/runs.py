@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +26,8 @@ from failuretwin.core.types import FloatArray, as_floats
 if TYPE_CHECKING:
     import xarray as xr
 
+RunSet: TypeAlias = "xr.Dataset"
+"""A run set, by a name that needs no xarray."""
 AXES = ("x", "y", "z")
 
 VARIABLES: dict[str, tuple[tuple[str, ...], str]] = {

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import parent_process
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from failuretwin.core.hypothesis import (
     parse_hypotheses,
 )
 from failuretwin.core.movements import Movements, stack_movements
-from failuretwin.core.runs import STEP_S, RunTable, Truth, concatenate
+from failuretwin.core.runs import STEP_S, RunSet, RunTable, Truth, concatenate
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.signals import SIMULATED, drive_of, simulated_sensors
 from failuretwin.data_knowledge.workers import Workforce
@@ -50,9 +50,6 @@ from failuretwin.failure_behavior.injection import Injection
 from failuretwin.failure_behavior.mode import FaultMode
 from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.failure_behavior.registry import MODES
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 # What to simulate: robot, states, imperfections, chance; small enough to write down.
 
@@ -244,12 +241,7 @@ def _draw(plan: Plan, run: int) -> _Draw:
 
 
 def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
-    """Simulate some of a plan's runs.
-
-    Args:
-        plan: Robot, faults, imperfections and seed of the runs.
-        runs: Numbers of the runs, each below `plan.size`.
-    """
+    """Simulate some of a plan's runs, by their numbers (each below `plan.size`)."""
     draws = [_draw(plan, run) for run in runs]
     chance = stack([draw.chance for draw in draws])
     commanded = delay_commands(stack_movements([draw.movements for draw in draws]), chance.late)
@@ -353,7 +345,7 @@ def simulate(
     workers: int = 1,
     on_progress: Callable[[int], None] = lambda runs: None,
     scheduler: str | None = None,
-) -> xr.Dataset:
+) -> RunSet:
     """Simulate all runs of a plan in memory; `resumable.produce` has no need to hold them.
 
     Args:

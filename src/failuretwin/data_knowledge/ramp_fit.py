@@ -7,41 +7,19 @@ The run axis of `Movements` counts the guesses.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import prod
 
 import numpy as np
 
 from failuretwin.core.movements import Movements
-from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.data_knowledge.readers.timed_log import Samples
 from failuretwin.digital_model.twin import DigitalTwin
 
 CONVERGED_M = 1e-14
 """Root mean square error [m] that only rounding can change."""
 DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-15, 1e3
 """Initial damping and its limits, relative to the largest diagonal entry of J'J."""
-
-
-@dataclass(frozen=True)
-class PathPart:
-    """Samples of a desired path.
-
-    Attributes:
-        time: (time,) [s].
-        point: Tool positions, (time, axis) [m].
-    """
-
-    time: FloatArray
-    point: FloatArray
-
-    def take(self, rows: IntArray | BoolArray | slice) -> PathPart:
-        """Return some of the samples."""
-        return PathPart(self.time[rows], self.point[rows])
-
-    def thinned(self, count: int) -> PathPart:
-        """Return at most `count` samples, evenly spread."""
-        rows = np.unique(np.linspace(0, len(self.time) - 1, count).round().astype(np.int64))
-        return self.take(rows)
 
 
 def single_movements(
@@ -53,14 +31,14 @@ def single_movements(
     return Movements(origin, target[:, None], duration[:, None], starts[:, None])
 
 
-def path_error(movements: Movements, path: PathPart, twin: DigitalTwin) -> FloatArray:
+def path_error(movements: Movements, path: Samples, twin: DigitalTwin) -> FloatArray:
     """Return the distance of the tool from a path, (guess, time) [m]."""
-    return np.linalg.norm(twin.path(movements.reference(path.time)) - path.point, axis=-1)
+    return np.linalg.norm(twin.path(movements.reference(path.time)) - path.value, axis=-1)
 
 
 def fit(
     guess: Movements,
-    part: PathPart,
+    part: Samples,
     twin: DigitalTwin,
     free: BoolArray,
     steps: int,
@@ -149,7 +127,7 @@ def _reference(pose: FloatArray, share: FloatArray) -> FloatArray:
 
 
 def _error_and_jacobian(
-    x: FloatArray, like: Movements, columns: BoolArray, part: PathPart, twin: DigitalTwin
+    x: FloatArray, like: Movements, columns: BoolArray, part: Samples, twin: DigitalTwin
 ) -> tuple[FloatArray, FloatArray]:
     """Return errors (guess, time * axis) [m] and derivatives (guess, time * axis, column).
 
@@ -175,4 +153,4 @@ def _error_and_jacobian(
     by_start = -by_motor @ speed.transpose(0, 2, 3, 1)
     J = np.concatenate([by_free, by_start], axis=-1)
     shape = (len(x), 3 * len(part.time))
-    return (path - part.point).reshape(shape), J.reshape(*shape, J.shape[-1])
+    return (path - part.value).reshape(shape), J.reshape(*shape, J.shape[-1])

@@ -20,7 +20,8 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements, stack_movements
 from failuretwin.core.runs import STEP_S
 from failuretwin.core.types import FloatArray, IntArray, as_floats, frozen_array
-from failuretwin.data_knowledge.ramp_fit import PathPart, fit, path_error, single_movements
+from failuretwin.data_knowledge.ramp_fit import fit, path_error, single_movements
+from failuretwin.data_knowledge.readers.timed_log import Samples
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -105,7 +106,7 @@ def recover_movements(
     grids = published_time_bases(desired.shape[1]) if time is None else [time]
     grid = _fitting_grid(grids, desired, robot)
     parts = [
-        _recover_run(PathPart(grid, path), robot, approximate, name)
+        _recover_run(Samples(grid, path), robot, approximate, name)
         for path, name in zip(desired, names, strict=True)
     ]
     return grid, stack_movements(parts)
@@ -133,14 +134,14 @@ def _fitting_grid(grids: Sequence[FloatArray], desired: FloatArray, robot: Robot
         fitting = []
         for grid in grids:
             with suppress(_NoWholeUnitsError):
-                _whole_run(PathPart(grid, path), robot)
+                _whole_run(Samples(grid, path), robot)
                 fitting.append(grid)
         if len(fitting) == 1:
             return fitting[0]
     return grids[0]
 
 
-def _recover_run(path: PathPart, robot: Robot, approximate: bool, name: str) -> Movements:
+def _recover_run(path: Samples, robot: Robot, approximate: bool, name: str) -> Movements:
     try:
         return _whole_run(path, robot)
     except _NoWholeUnitsError as reason:
@@ -157,7 +158,7 @@ class _NoWholeUnitsError(Exception):
     """No movements between whole counts make the path; the text says where."""
 
 
-def _whole_run(path: PathPart, robot: Robot) -> Movements:
+def _whole_run(path: Samples, robot: Robot) -> Movements:
     """Return the movements between whole counts that make a path.
 
     Where next to nothing is seen of the last one, its targets may lie between counts.
@@ -173,7 +174,7 @@ def _whole_run(path: PathPart, robot: Robot) -> Movements:
     return movements
 
 
-def _nearest_run(path: PathPart, robot: Robot, name: str) -> Movements:
+def _nearest_run(path: Samples, robot: Robot, name: str) -> Movements:
     """Return the movements that fit a path best."""
     least, best = np.inf, None
     for seed in SEEDS:
@@ -193,12 +194,12 @@ def _nearest_run(path: PathPart, robot: Robot, name: str) -> Movements:
     return best
 
 
-def _noise(path: PathPart) -> float:
+def _noise(path: Samples) -> float:
     """Return the standard deviation of a path's noise on each axis [m].
 
     The lower quartile of second differences, 0.32 sqrt(6) deviations, counts the samples at rest.
     """
-    bends = np.abs(np.diff(path.point, 2, axis=0))
+    bends = np.abs(np.diff(path.value, 2, axis=0))
     return float(np.quantile(bends, 0.25) / (0.32 * np.sqrt(6.0))) if bends.size else 0.0
 
 
@@ -217,7 +218,7 @@ class _Run:
         rng: Draws first guesses.
     """
 
-    path: PathPart
+    path: Samples
     twin: DigitalTwin
     noise: float
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
@@ -234,7 +235,7 @@ class _Run:
     @cached_property
     def spans(self) -> list[Span]:
         """Samples around every movement that stands out of the noise."""
-        time, point, end = self.path.time, self.path.point, len(self.path.time) - 1
+        time, point, end = self.path.time, self.path.value, len(self.path.time) - 1
         width = SMOOTH_SAMPLES if self.noise > NO_NOISE_M and end >= 3 * SMOOTH_SAMPLES else 1
         average = [np.convolve(axis, np.full(width, 1.0 / width), "valid") for axis in point.T]
         smooth = np.stack(average, axis=1)
@@ -256,7 +257,7 @@ class _Run:
         begins = [0, *(last for _, last in self.spans)]
         ends = [*(first for first, _ in self.spans), len(self.path.time) - 1]
         return [
-            np.median(self.path.point[begin : max(begin, end) + 1], axis=0)
+            np.median(self.path.value[begin : max(begin, end) + 1], axis=0)
             for begin, end in zip(begins, ends, strict=True)
         ]
 
@@ -264,7 +265,7 @@ class _Run:
 
     def whole(self) -> Movements:
         if not self.spans:
-            return self._joined(self._whole_poses(self.path.point[0])[:1], [])
+            return self._joined(self._whole_poses(self.path.value[0])[:1], [])
         if self.spans == [(0, len(self.path.time) - 1)]:
             raise _NoWholeUnitsError("the record holds no settled pose")
         return self._chain(self._whole_ramps)
@@ -324,7 +325,7 @@ class _Run:
         if not self._is_cut_off(m) and len(self._zero) <= MOST_MOTORS:
             yield self._fitted(m, origins, self._whole_poses(self.rests[m + 1]), GUESSES[-1])
 
-    def _rounded(self, ramp: Movements, part: PathPart, free_origin: bool) -> Movements:
+    def _rounded(self, ramp: Movements, part: Samples, free_origin: bool) -> Movements:
         """Return the exact ramps of published durations to whole counts near a fitted ramp.
 
         The speeds of the ramp hold: target = origin + speed * duration. If it is under way when the
@@ -417,13 +418,14 @@ class _Run:
     def _is_cut_off(self, m: int) -> bool:
         return self.spans[m][1] == len(self.path.time) - 1
 
-    def _part(self, m: int) -> PathPart:
+    def _part(self, m: int) -> Samples:
         """Return samples of movement `m` and of the rests around it."""
         first, last = self.spans[m]
         before = self.spans[m - 1][1] if m else 0
         after = self.spans[m + 1][0] if m + 1 < len(self.spans) else len(self.path.time) - 1
         first, last = max(first - REST_SAMPLES, before), min(last + REST_SAMPLES, after)
-        return self.path.take(slice(first, last + 1)).thinned(FIT_SAMPLES)
+        rows = np.unique(np.linspace(first, last, FIT_SAMPLES).round().astype(np.int64))
+        return self.path.take(rows)
 
     def _poses(self, point: FloatArray, count: int) -> FloatArray:
         """Return poses all over the arm's range at a point, (pose, motor) [rad]."""

@@ -126,8 +126,25 @@ class UnfinishedRunSet(Unfinished):
         return [self.store / name / f"c.{piece}{end}" for name, end in sorted(KEY_ENDS.items())]
 
     def make(self, piece: int) -> str:
-        """Make a chunk and write it; return the hash of its files."""
-        return make_chunk(self, piece)
+        """Make a chunk and write it; return the hash of its files.
+
+        Every file appears whole, so it does no harm if two processes make the same chunk.
+
+        Raises:
+            InputError: If this process has other versions than the one that asks, or cannot see
+                where the run set is made.
+            OSError: If the chunk cannot be written.
+        """
+        import zarr
+
+        self.check_worker()
+        runs = self.chunks[piece]
+        part = simulate_runs(self.plan, runs).to_dataset()
+        with writing_zarr():
+            for name in KEY_ENDS.keys() & part.variables:
+                array = zarr.open_array(self.store / name, mode="r+")
+                array[runs.start : runs.stop] = part[name].values
+        return self.mark(piece)
 
     def begin(self) -> None:
         """Write everything that does not depend on the runs, unless an earlier attempt has."""
@@ -154,12 +171,7 @@ class UnfinishedRunSet(Unfinished):
         (self.store / GROUP).rename(self.folder / GROUP)
 
     def finish(self, content: str, path: Path) -> None:
-        """Make the store readable and put it in the place of `path`.
-
-        Args:
-            content: Hash of the runs.
-            path: Where the run set belongs; on an OSError it is as before.
-        """
+        """Make the store readable and put it in the place of `path`."""
         for torn in self.store.rglob("*.partial"):  # of a process that was killed as it wrote
             torn.unlink()
         manifest = {**_manifest(self.plan, self.chunk_runs), "content": content}
@@ -168,28 +180,6 @@ class UnfinishedRunSet(Unfinished):
         shutil.copyfile(self.folder / GROUP, self.store / GROUP)
         atomic_replace(self.store, path)
         self.remove()
-
-
-def make_chunk(unfinished: UnfinishedRunSet, chunk: int) -> str:
-    """Make a chunk and write it; return the hash of its files.
-
-    Every file appears whole, so it does no harm if two processes make the same chunk.
-
-    Raises:
-        InputError: If this process has other versions than the one that asks, or cannot see
-            where the run set is made.
-        OSError: If the chunk cannot be written.
-    """
-    import zarr
-
-    unfinished.check_worker()
-    runs = unfinished.chunks[chunk]
-    part = simulate_runs(unfinished.plan, runs).to_dataset()
-    with writing_zarr():
-        for name in KEY_ENDS.keys() & part.variables:
-            array = zarr.open_array(unfinished.store / name, mode="r+")
-            array[runs.start : runs.stop] = part[name].values
-    return unfinished.mark(chunk)
 
 
 def _manifest(plan: Plan, chunk_runs: int) -> dict[str, Any]:

@@ -40,14 +40,7 @@ def drive_of(
     injection: Injection,
     chance: Disturbances,
 ) -> Drive:
-    """Return the references and faults that drive the motors of some runs.
-
-    Args:
-        commanded: Movements as commanded.
-        time: Uniform grid, (time,) [s].
-        injection: Faults of the runs.
-        chance: Bad luck of the runs.
-    """
+    """Return the references and faults that drive the motors of some runs on a grid (time,) [s]."""
     faulty, lost = injection.on_movements(commanded, chance.lost)
     actual = actual_movements(faulty, replace(chance, lost=lost))
     followed = lagged(actual.reference(time), time, chance.lag)
@@ -69,12 +62,7 @@ def noise_free_path(
 ) -> FloatArray:
     """Return the path of the tool with faults, and without scatter, losses, stalls and glitches.
 
-    Args:
-        twin: Digital twin of the robot.
-        imperfections: How the healthy robot differs from it.
-        movements: As commanded.
-        time: Uniform grid, (time,) [s].
-        injection: Faults of the runs.
+    `time` is a uniform grid, (time,) [s].
 
     Returns:
         (run, time, axis) [m].

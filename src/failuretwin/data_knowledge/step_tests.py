@@ -38,9 +38,7 @@ RESTLESS_COUNTS = 12.0
 def flaw_of_readings(time: FloatArray, rest: FloatArray) -> str:
     """Return what keeps readings about a step from telling anything, or nothing.
 
-    Args:
-        time: Their times since the command, (reading,) [s].
-        rest: Those at the end, (reading,) [counts].
+    `time` counts from the command, (reading,) [s]; `rest` are the readings at the end [counts].
     """
     if len(time) < FEWEST or len(rest) < FEWEST_AT_REST or time[0] > -REST_S:
         return "has too few readings before, during or after it"
@@ -56,13 +54,7 @@ def flaw_of_readings(time: FloatArray, rest: FloatArray) -> str:
 
 
 def flaw_of_motion(start: float, settled: float, target: float) -> str:
-    """Return why a motor is no healthy one, or nothing.
-
-    Args:
-        start: Where it rested before [counts].
-        settled: Where it rested after [counts].
-        target: Where it was sent [counts].
-    """
+    """Return why a motor is not healthy, or nothing; angles are in servo counts."""
     travel = target - start
     if abs(travel) < SMALLEST_COUNTS:
         return f"is told to move by {abs(travel):.0f} counts only"

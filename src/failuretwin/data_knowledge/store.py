@@ -35,57 +35,40 @@ def load_run_set(path: Path) -> xr.Dataset:
         InputError: If the file cannot be read, is not a run set, claims more than it can mean, or
             has a codec that this package does not write.
     """
-    with reading(path, "a run set", EXPECTED):
-        if path.suffix == ".nc":
-            check_netcdf(path)
-            opened = _open_netcdf(path)
-        else:
-            check_zarr(path)
-            opened = _open_zarr(path)
-        with opened as stored:
-            runs = check_runs(stored.load(), str(path))
-            # A step more is accepted: thinning of the grid may have kept the length.
-            check_duration(runs, str(path), float(runs["time"].values[-1]) + time_step(runs))
-            return runs
+    with reading(path, "a run set", EXPECTED), _checked(path, None) as stored:
+        runs = check_runs(stored.load(), str(path))
+        # A step more is accepted: thinning of the grid may have kept the length.
+        check_duration(runs, str(path), float(runs["time"].values[-1]) + time_step(runs))
+        return runs
 
 
 def open_run_set(path: Path, most_runs: int) -> xr.Dataset:
     """Open a stored run set of any size; values are read when they are asked for.
 
-    What the file claims is checked; the values of the runs are not.
-
-    Args:
-        path: The run set.
-        most_runs: The most runs that will be in memory at a time.
+    What the file claims of so many runs in memory at a time is checked; the values are not.
 
     Raises:
         InputError: If the file cannot be read, is not a run set, claims more than it can mean, or
             has a codec that this package does not write.
     """
     with reading(path, "a run set", EXPECTED):
-        if path.suffix == ".nc":
-            check_netcdf(path, most_runs)
-            opened = _open_netcdf(path)
-        else:
-            check_zarr(path, most_runs)
-            opened = _open_zarr(path)
+        opened = _checked(path, most_runs)
         check_layout(opened, str(path))
         return opened
 
 
-def _open_netcdf(path: Path) -> xr.Dataset:
-    import xarray as xr
+def _checked(path: Path, most_runs: int | None) -> xr.Dataset:
+    """Open a run set once what it claims of `most_runs` in memory (None: all) has been checked.
 
-    return xr.open_dataset(path, engine="h5netcdf", decode_times=False)
-
-
-def _open_zarr(path: Path) -> xr.Dataset:
-    """Return a store by the very metadata that were checked, not by the copy in its root.
-
-    It is read at once, so nothing is gained by Dask's arrays.
+    A Zarr store is opened by the very metadata that were checked, not by the copy in its root,
+    and without Dask's arrays, by which nothing would be gained.
     """
     import xarray as xr
 
+    if path.suffix == ".nc":
+        check_netcdf(path, most_runs)
+        return xr.open_dataset(path, engine="h5netcdf", decode_times=False)
+    check_zarr(path, most_runs)
     with warnings.catch_warnings():  # our manifest lies beside the arrays
         warnings.filterwarnings("ignore", message="Object at .* is not recognized")
         return xr.open_zarr(path, chunks=None, consolidated=False, decode_times=False)
@@ -299,11 +282,7 @@ def sole_writer(path: Path, patience_s: float = 0.0) -> Iterator[None]:
     """Hold the lock `.NAME.lock` beside `path`; nobody else can write `path` meanwhile.
 
     The system lets go of the lock when its process dies, however that happens, so the file of a
-    dead process holds nobody back.
-
-    Args:
-        path: What is written.
-        patience_s: Time to wait for another writer [s].
+    dead process holds nobody back. `patience_s` is how long another writer is waited for [s].
 
     Raises:
         OutputError: If another process holds it, or if it cannot be made.

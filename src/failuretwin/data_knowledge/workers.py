@@ -80,11 +80,8 @@ class Workforce:
     ) -> Iterator[Iterator[Result]]:
         """Give the results in the order of the items; leaving the block ends the work.
 
-        A worker that dies is replaced and its items are given to others.
-
-        Args:
-            work: A function that other processes can import.
-            items: Its arguments, one per call.
+        Other processes must be able to import `work`. A worker that dies is replaced and its items
+        are given to others.
 
         Raises:
             InputError: If Dask is not installed, or the scheduler or its workers do not answer

@@ -10,7 +10,7 @@ from small_world import SmallWorld, carry_out, task_of
 
 from failuretwin import InputError
 from failuretwin.app.arms import spared_of
-from failuretwin.connection.life_history import read_rows
+from failuretwin.connection.tracked_diagnosis import read_rows
 from failuretwin.decision.acting.planner import Planner, Standing, turned_round, wear_weights
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.inference.together.wear_limits import WearLimits, wear_unit

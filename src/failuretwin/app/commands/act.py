@@ -102,7 +102,7 @@ def _tracked_rows(
     Raises:
         InputError: If it cannot be read, holds no run, or is of another robot.
     """
-    from failuretwin.connection.life_history import read_rows
+    from failuretwin.connection.tracked_diagnosis import read_rows
 
     if history is None:
         return ()

@@ -103,7 +103,7 @@ def watch(
     from failuretwin.app.live import basis_line, fit_of, watch_until_end
     from failuretwin.app.shadow import Shadow
     from failuretwin.connection.links.recorder import Recorder
-    from failuretwin.connection.links.ros_topics import load_topics
+    from failuretwin.connection.links.ros_messages import load_topics
     from failuretwin.connection.links.statuses import statuses
     from failuretwin.decision.streaming.monitor import monitor
     from failuretwin.decision.streaming.set_up_watch import PROOF

@@ -186,7 +186,7 @@ def _life_report(source: Path | None, memory: StoreOptions, robot: opt.RobotOpti
     """Return the remaining life of every motor of a tracked robot; no source: that of the store."""
     import numpy as np
 
-    from failuretwin.connection.life_history import read_rows
+    from failuretwin.connection.tracked_diagnosis import read_rows
     from failuretwin.decision.remaining_life import LEAST_RUNS, motor_lives
     from failuretwin.inference.observation.healthy_model import HealthyModel
 

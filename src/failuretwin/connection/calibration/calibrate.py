@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -49,11 +48,12 @@ from failuretwin.connection.calibration.timing_fit import (
     gap_starts,
     lateness,
     movements_of,
+    punctual,
     transients,
 )
 from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
 from failuretwin.core.errors import InputError
-from failuretwin.core.runs import check_motors, truth_of
+from failuretwin.core.runs import RunSet, check_motors, truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.digital_model.arm_classes import class_of, generic_imperfections
@@ -64,9 +64,6 @@ from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.on_the_way import hardly_rest
 from failuretwin.inference.observation.sensors import TOOL_ALONE, sensing_of
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 # Which runs had better not teach the twin, and why.
 
@@ -80,13 +77,7 @@ whole, and logs are refused. Of ten healthy runs three look faulty in one sessio
 def exclude_suspect_runs(
     names: Sequence[str], sessions: Sequence[str], fault_probability: FloatArray
 ) -> list[LeftOut]:
-    """Return the runs that look faulty, and those of sessions that do.
-
-    Args:
-        names: Names of the runs.
-        sessions: The session of each run.
-        fault_probability: That of each run, (run,).
-    """
+    """Return the runs that look faulty, and those of sessions that do."""
     suspect, of = fault_probability >= SUSPECT, np.asarray(sessions)
     found = []
     for i, name in enumerate(names):
@@ -101,14 +92,13 @@ def exclude_suspect_runs(
 
 
 def fit_calibration(
-    runs: xr.Dataset,
+    runs: RunSet,
     robot: Robot,
     name: str,
     source: str,
     *,
     fault_probability: FloatArray | None = None,
-    use_readings: bool = True,
-    judged: xr.Dataset | None = None,
+    judged: RunSet | None = None,
     thorough: bool = True,
 ) -> Calibration:
     """Learn the imperfections of a robot from healthy runs.
@@ -120,7 +110,6 @@ def fit_calibration(
         source: Which logs they come from.
         fault_probability: That of each run, (run,); runs and sessions that look faulty are left
             out. None: all count.
-        use_readings: Whether to look at the motors' own readings, where the runs have them.
         judged: Healthy runs of sessions that only say how good the fit is; None: each session is
             left out once and judged by a fit to the others.
         thorough: Whether to check the fit on sessions that it has not seen, and the senses and
@@ -134,7 +123,7 @@ def fit_calibration(
     left_out = exclude_suspect_runs(names, session_names(runs), doubt)
     out = {entry.run for entry in left_out}
     kept = runs.isel(run=[i for i, run in enumerate(names) if run not in out])
-    part = fit_settling(observe(kept, robot, use_readings=use_readings))
+    part = fit_settling(observe(kept, robot))
     payload, remarks = 0.0, list[str]()
     if thorough:
         payload, told = best_payload(part, robot)
@@ -144,9 +133,11 @@ def fit_calibration(
             part = fit_settling(part.observations.of(model))
     movements = movements_of(kept)
     late = lateness(movements)
-    losses = loss_rates(part.observations, part.sorted.lost, late.punctual, late.delayed, robot)
-    timing = fit_timing(transients(kept, movements, late, part, part.settling, robot), robot)
-    gaps = gap_starts(kept, movements, late.late)
+    seen, became = part.observations, part.sorted
+    losses = loss_rates(seen, became.lost, punctual(late), late > 0.0, robot)
+    ramps = transients(kept, movements, late, seen, became, part.settling, robot)
+    timing = fit_timing(ramps, robot)
+    gaps = gap_starts(kept, movements, late)
     glitches = glitch_rates(kept) if part.observations.of_motors else None
     imperfections = Imperfections(
         name=name,
@@ -184,11 +175,10 @@ def fit_calibration(
     )
 
 
-def _held_out(part: SettlingFit, robot: Robot, judged: xr.Dataset | None) -> tuple[HeldOut, ...]:
-    seen = part.observations
+def _held_out(part: SettlingFit, robot: Robot, judged: RunSet | None) -> tuple[HeldOut, ...]:
     if judged is None:
         return cross_validate(part, robot)
-    unseen = observe(judged, robot, use_readings=seen.of_motors)
+    unseen = observe(judged, robot)
     entries = [
         judge(unseen[np.flatnonzero(unseen.session == index)], part, robot, name)
         for index, name in enumerate(unseen.sessions)
@@ -286,7 +276,7 @@ def _with_sensors(found: Calibration, fits: Sequence[SensorFit]) -> Calibration:
     )
 
 
-def _of_sensors_alone(runs: xr.Dataset, robot: Robot, name: str, source: str) -> Calibration:
+def _of_sensors_alone(runs: RunSet, robot: Robot, name: str, source: str) -> Calibration:
     """Return a calibration of sensors by runs of which nobody saw the tool's position.
 
     Raises:
@@ -310,13 +300,13 @@ def _of_sensors_alone(runs: xr.Dataset, robot: Robot, name: str, source: str) ->
     return _with_sensors(plain, fits)
 
 
-def _never_rests(runs: xr.Dataset, robot: Robot) -> bool:
+def _never_rests(runs: RunSet, robot: Robot) -> bool:
     """Return whether most of the runs are judged by readings on the way."""
     model = HealthyModel.of(robot, generic_imperfections(robot))
     return bool(hardly_rest(Evidence(runs, model.settings).sound, model).mean() > 0.5)
 
 
-def _of_the_way(runs: xr.Dataset, robot: Robot, name: str, source: str) -> Calibration:
+def _of_the_way(runs: RunSet, robot: Robot, name: str, source: str) -> Calibration:
     """Return a calibration by readings on the way, of an arm that never rests.
 
     It is the posterior of what arms of the class are like (`SelfCalibratingDiagnoser`); runs that
@@ -336,7 +326,7 @@ def _of_the_way(runs: xr.Dataset, robot: Robot, name: str, source: str) -> Calib
     return replace(found.calibration, imperfections=learned, remarks=remarks)
 
 
-def _without_faulty_labels(runs: xr.Dataset) -> tuple[xr.Dataset, tuple[LeftOut, ...]]:
+def _without_faulty_labels(runs: RunSet) -> tuple[RunSet, tuple[LeftOut, ...]]:
     truth = truth_of(runs)
     if truth is None:
         return runs, ()
@@ -353,7 +343,7 @@ def _without_faulty_labels(runs: xr.Dataset) -> tuple[xr.Dataset, tuple[LeftOut,
     return runs.isel(run=np.flatnonzero(healthy)), labelled
 
 
-def _held_out_runs(runs: xr.Dataset, hold_out: str | None) -> np.ndarray:
+def _held_out_runs(runs: RunSet, hold_out: str | None) -> np.ndarray:
     sessions = session_names(runs)
     inside = np.array([hold_out is not None and hold_out in session for session in sessions])
     known = ", ".join(dict.fromkeys(sessions))
@@ -376,7 +366,7 @@ def _refuse_scatter(first: Calibration, robot: Robot) -> None:
             )
 
 
-def _refuse_suspects(runs: xr.Dataset, doubt: FloatArray) -> None:
+def _refuse_suspects(runs: RunSet, doubt: FloatArray) -> None:
     suspects = np.flatnonzero(doubt >= SUSPECT)
     if len(suspects) > MOST_SUSPECT * len(doubt):
         names = [str(runs["run"].values[i]) for i in suspects[:5]]

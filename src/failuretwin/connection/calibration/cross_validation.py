@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,15 +27,13 @@ from failuretwin.connection.calibration.timing_fit import (
 )
 from failuretwin.core.errors import InputError
 from failuretwin.core.numerics import log_student
+from failuretwin.core.runs import RunSet
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.observation.healthy_model import PATH_NOISE_M, HealthyModel
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 TO_DEVIATION = 1.4826
 """Median absolute deviation to standard deviation of a normal distribution."""
@@ -60,16 +57,10 @@ def cross_validate(part: SettlingFit, robot: Robot) -> tuple[HeldOut, ...]:
 def judge(
     observations: Observations, others: SettlingFit, robot: Robot, session: str
 ) -> HeldOut | None:
-    """Return how well a fit predicts settled movements that it has not seen.
+    """Return how well the fit to other sessions predicts the settled movements of a session.
 
     Movements whose commands did not arrive are left out: there is nothing to predict of them. None
     if fewer than two are left, for one movement says nothing of scatter.
-
-    Args:
-        observations: Settled movements of one session.
-        others: The fit to other sessions.
-        robot: The robot.
-        session: Name of the session.
     """
     settling = others.settling
     kind = HealthyModel.of(robot, generic_imperfections(robot))
@@ -111,10 +102,7 @@ def settled_errors(
 ) -> FloatArray:
     """Return settled minus expected: of motors [rad] or of the tool [m], a row a movement.
 
-    Args:
-        observations: Settled movements.
-        robot: The robot.
-        settling: Where its motors settle; None: exactly at their targets.
+    Without `settling` motors are expected exactly at their targets.
     """
     pose = expected_pose(observations, robot, settling)
     if observations.position is not None:
@@ -176,7 +164,7 @@ class Predictions:
     unseen: bool
 
 
-def trusted_runs(found: Calibration, runs: xr.Dataset) -> xr.Dataset:
+def trusted_runs(found: Calibration, runs: RunSet) -> RunSet:
     """Return the runs that were not left out as a whole."""
     out = {entry.run for entry in found.left_out if entry.movement == 0}
     kept = [i for i, run in enumerate(runs["run"].values) if str(run) not in out]
@@ -188,16 +176,11 @@ def settling_of(found: Calibration, robot: Robot) -> Settling:
     return found.imperfections.settling or Settling.ideal(len(robot.motors))
 
 
-def predict(found: Calibration, runs: xr.Dataset, robot: Robot) -> Predictions:
+def predict(found: Calibration, runs: RunSet, robot: Robot) -> Predictions:
     """Return what the calibration expects of the sessions held out.
 
     Where none were, each session is expected by a fit to the others; with one session alone, by
     the calibration itself.
-
-    Args:
-        found: The calibration.
-        runs: The runs it was learned from or judged on.
-        robot: The robot.
     """
     seen, settling = _observed(found, runs, robot), settling_of(found, robot)
     learned = np.array([name in found.sessions for name in seen.sessions])[seen.session]
@@ -212,11 +195,17 @@ def predict(found: Calibration, runs: xr.Dataset, robot: Robot) -> Predictions:
     return _predictions(seen, found, robot, pose, unseen)
 
 
-def _observed(found: Calibration, runs: xr.Dataset, robot: Robot) -> Observations:
+def _observed(found: Calibration, runs: RunSet, robot: Robot) -> Observations:
     """Return the movements of trusted runs, of a robot with the payload of the calibration."""
-    seen = observe(trusted_runs(found, runs), robot, use_readings=found.used_readings)
+    seen = observe(trusted_runs(found, runs), robot)
     payload = settling_of(found, robot).payload
     return seen.of(uncalibrated(robot, seen.of_motors, payload=payload))
+
+
+def _sorted(seen: Observations, found: Calibration) -> SortedMovements:
+    """Return what became of movements by a calibration."""
+    known = replace(found.imperfections, sensors=seen.model.imperfections.sensors)
+    return SortedMovements.of(seen, replace(seen.model, imperfections=known))
 
 
 def _expected_by_others(seen: Observations, robot: Robot) -> FloatArray | None:
@@ -237,10 +226,8 @@ def _expected_by_others(seen: Observations, robot: Robot) -> FloatArray | None:
 def _predictions(
     seen: Observations, found: Calibration, robot: Robot, pose: FloatArray, unseen: bool
 ) -> Predictions:
-    settling = settling_of(found, robot)
-    known = replace(found.imperfections, sensors=seen.model.imperfections.sensors)
-    sorting = SortedMovements.of(seen, replace(seen.model, imperfections=known))
-    lost, odd = sorting.lost, sorting.odd
+    settling, became = settling_of(found, robot), _sorted(seen, found)
+    lost, odd = became.lost, became.odd
     twin, scatter = DigitalTwin(robot), np.asarray(settling.scatter)
     error = settled_errors(seen, robot, None)
     if seen.position is not None:
@@ -296,25 +283,17 @@ class ExampleTransient:
     of_motors: bool
 
 
-def example_transient(
-    found: Calibration, runs: xr.Dataset, robot: Robot
-) -> ExampleTransient | None:
+def example_transient(found: Calibration, runs: RunSet, robot: Robot) -> ExampleTransient | None:
     """Return the movement that the calibrated twin fits neither well nor badly, but typically.
 
     It is taken from the longer half of the movements that began on time at a known place; None if
     there are none.
-
-    Args:
-        found: The calibration.
-        runs: The runs it was learned from or judged on.
-        robot: The robot.
     """
     runs = trusted_runs(found, runs)
     settling = settling_of(found, robot)
-    part = fit_settling(_observed(found, runs, robot))
-    movements = movements_of(runs)
-    # What is shown is the calibration, which may have seen fewer sessions than this fit.
-    ramps = transients(runs, movements, lateness(movements), part, settling, robot)
+    seen, movements = _observed(found, runs, robot), movements_of(runs)
+    became = _sorted(seen, found)
+    ramps = transients(runs, movements, lateness(movements), seen, became, settling, robot)
     twin = DigitalTwin(robot)
     timing = found.imperfections.timing
     usual = np.array([np.mean(timing.delay_s), np.mean(timing.ramp_shortening)])

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.core.runs import measured_rate
+from failuretwin.core.runs import RunSet, measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Readings
@@ -18,9 +17,6 @@ from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.sensors import TOOL_ALONE
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 ROUNDING = float(1.0 / np.sqrt(12.0))
 """Standard deviation of what whole numbers round off."""
@@ -115,21 +111,15 @@ class Observations:
         return self.model.sensors.angles(self.evidence.point[self.at])
 
 
-def session_names(runs: xr.Dataset) -> list[str]:
+def session_names(runs: RunSet) -> list[str]:
     """Return the session of each run: its name without the last part, or its own name."""
     names = [str(name) for name in runs["run"].values]
     return [name.rpartition("/")[0] or name for name in names]
 
 
-def observe(runs: xr.Dataset, robot: Robot, *, use_readings: bool = True) -> Observations:
-    """Return where the movements of a run set settled.
-
-    Args:
-        runs: Healthy runs.
-        robot: The robot.
-        use_readings: Whether to look at the motors' own readings, where the runs have them.
-    """
-    of_motors = use_readings and "position" in runs
+def observe(runs: RunSet, robot: Robot) -> Observations:
+    """Return where movements settled, by the motors' own readings where the runs have them."""
+    of_motors = "position" in runs
     model = uncalibrated(robot, of_motors, measured_rate(runs))
     tool = evidence = Evidence(runs, model.settings).sound.settled
     if of_motors:
@@ -152,11 +142,7 @@ def uncalibrated(
 ) -> HealthyModel:
     """Return what is believed of a robot before its healthy logs: what arms of its class are like.
 
-    Args:
-        robot: The robot.
-        of_motors: Whether its motors are read, in whole counts where the profile has any.
-        rate_hz: Rate of the readings [Hz].
-        payload: Mass at the tool point [kg].
+    Motors that are read give whole counts where the profile has any. `payload` is in [kg].
     """
     kind = generic_imperfections(robot)
     assert kind.settling is not None
@@ -170,13 +156,8 @@ def uncalibrated(
     return HealthyModel(DigitalTwin(robot), known, sensing=sensing)
 
 
-def count_of(robot: Robot) -> float:
-    """Return the step that the motors are read in [rad]; 0 without servo units."""
+def rounding(robot: Robot) -> float:
+    """Return the standard deviation of what servo counts round off [rad]; 0 without any."""
     if robot.profile.servo_units is None:
         return 0.0
-    return float(abs(robot.servo_units.rad_per_count))
-
-
-def rounding(robot: Robot) -> float:
-    """Return the standard deviation of what whole servo counts round off [rad]."""
-    return count_of(robot) * ROUNDING
+    return float(abs(robot.servo_units.rad_per_count)) * ROUNDING

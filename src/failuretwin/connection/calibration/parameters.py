@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import brentq
@@ -16,18 +15,15 @@ from failuretwin.connection.calibration.settling_fit import (
     DOF_PRIOR_SPREAD,
     SettlingPosterior,
 )
-from failuretwin.connection.calibration.timing_fit import BOUNDS, Lateness, TimingFit
+from failuretwin.connection.calibration.timing_fit import BOUNDS, TimingFit
 from failuretwin.core.movements import Movements
-from failuretwin.core.runs import measured_rate
+from failuretwin.core.runs import RunSet, measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.arm_classes import class_of
 from failuretwin.digital_model.nonidealities import LostCommand, Range, Readings, Schedule, Timing
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import largest_load
 from failuretwin.inference.together.habits import HEAVIEST, RATE_COUNT
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 # How often things go wrong by chance, from counts in healthy logs.
 
@@ -114,13 +110,8 @@ def loss_rates(
     """Return the rate of each single motor, and of each set that was seen to go together.
 
     Before any log the punctual rate is that of the arm's class, and the late one is the punctual.
-
-    Args:
-        observations: Settled movements.
-        lost: Motors that stayed, (movement, motor).
-        punctual: Movements that started on time, (run, movement).
-        delayed: Movements that started late, (run, movement); what is neither does not count.
-        robot: The arm.
+    `lost` are the motors that stayed, (movement, motor); movements (run, movement) that are neither
+    punctual nor delayed do not count.
     """
     at, names, kind = observations.at, robot.motor_names, class_of(robot)
     seen = {tuple(np.flatnonzero(row).tolist()) for row in lost if row.any()}
@@ -144,7 +135,7 @@ def loss_rates(
     return rates
 
 
-def glitch_rates(runs: xr.Dataset) -> list[Rate] | None:
+def glitch_rates(runs: RunSet) -> list[Rate] | None:
     """Return the share of spoilt readings of each motor; None where motors were not read."""
     if "position" not in runs:
         return None
@@ -201,7 +192,7 @@ def settling_parameters(fit: SettlingPosterior, robot: Robot, payload: float) ->
     found = []
     for group, (name, unit) in enumerate(SETTLING_UNITS.items()):
         for k, motor in enumerate(robot.motor_names):
-            at = group * fit.motors + k
+            at = group * len(load) + k
             value, deviation = float(fit.mode[at]), float(fit.deviation[at])
             learned = bool(deviation < LEARNED * fit.prior_deviation[at])
             note = "" if learned else f"the logs do not say; it takes {ADVICE[name]}"
@@ -304,13 +295,10 @@ FEWEST = 6
 """Values below which nothing is said of how they spread."""
 
 
-def timing_of(fit: TimingFit | None, late: Lateness, gaps: FloatArray) -> Timing:
+def timing_of(fit: TimingFit | None, late: FloatArray, gaps: FloatArray) -> Timing:
     """Return how motions run late.
 
-    Args:
-        fit: Delay, lag and shortening; None: the logs do not say.
-        late: Late starts.
-        gaps: When readings stopped before them [s].
+    Without a fit the logs say nothing of delay, shortening and lag.
     """
     timing = Timing()
     if fit is not None:
@@ -320,7 +308,7 @@ def timing_of(fit: TimingFit | None, late: Lateness, gaps: FloatArray) -> Timing
             ramp_shortening=spread_of(fit.shortening),
             lag_s=(fit.lag, fit.lag),
         )
-    starts = late_starts(late)
+    starts = late[late > 0.0]
     if len(starts) < FEWEST:
         return timing
     return replace(
@@ -331,14 +319,9 @@ def timing_of(fit: TimingFit | None, late: Lateness, gaps: FloatArray) -> Timing
     )
 
 
-def late_starts(late: Lateness) -> FloatArray:
-    """Return how late the late movements started, (late movement,) [s]."""
-    return late.late[late.delayed]
-
-
-def late_rate(late: Lateness) -> Rate:
+def late_rate(late: FloatArray) -> Rate:
     """Return the share of late movements; nothing before the first one of a run can stall."""
-    after_first = late.late[:, 1:]
+    after_first = late[:, 1:]
     known = after_first[np.isfinite(after_first)]
     return Rate(int(np.sum(known > 0.0)), len(known))
 
@@ -347,11 +330,11 @@ def _above_zero(values: Range) -> Range:
     return max(values[0], 0.0), max(values[1], 0.0)
 
 
-def schedule_of(movements: Movements, late: Lateness, robot: Robot) -> Schedule:
+def schedule_of(movements: Movements, late: FloatArray, robot: Robot) -> Schedule:
     """Return the schedule of the logs; runs of another length keep its pace."""
     first = movements.start[:, 0]
     spacing = np.diff(movements.start, axis=1)
-    punctual = spacing[np.nan_to_num(late.late[:, :-1], nan=1.0) == 0.0]
+    punctual = spacing[np.nan_to_num(late[:, :-1], nan=1.0) == 0.0]
     if len(punctual) == 0:
         return Schedule()
     whole = False
@@ -365,7 +348,7 @@ def schedule_of(movements: Movements, late: Lateness, robot: Robot) -> Schedule:
     )
 
 
-def readings_of(runs: xr.Dataset, robot: Robot, glitches: Sequence[Rate] | None) -> Readings:
+def readings_of(runs: RunSet, robot: Robot, glitches: Sequence[Rate] | None) -> Readings:
     """Return how the sensors sample: their rate, whole counts, spoilt readings."""
     whole = False
     if robot.profile.servo_units is not None and "position" in runs:
@@ -379,14 +362,13 @@ def readings_of(runs: xr.Dataset, robot: Robot, glitches: Sequence[Rate] | None)
     )
 
 
-def lateness_parameters(late: Lateness, gaps: FloatArray) -> list[Parameter]:
+def lateness_parameters(late: FloatArray, gaps: FloatArray) -> list[Parameter]:
     """Return the rate of late starts, how late they are, and when readings stop before them."""
-    if not late.known:
+    if np.isnan(late).all():
         note = "commands do not come at a steady pace; send them on a fixed schedule"
         return [Parameter("late starts", "", "share", 0.0, 0.0, 1.0, False, note)]
     found = [rate_parameter("late starts", "", late_rate(late))]
-    starts = late_starts(late)
-    for name, values in (("late start, median", starts), ("readings stop, median", gaps)):
+    for name, values in (("late start, median", late[late > 0.0]), ("readings stop, median", gaps)):
         if len(values) >= FEWEST:
             found.append(Parameter(name, "", "s", *median_interval(values)))
     return found

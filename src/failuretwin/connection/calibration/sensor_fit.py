@@ -12,7 +12,6 @@ Section: docs/sensors.md#sensors-in-the-profile
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,14 +20,12 @@ from failuretwin.connection.calibration.result import Parameter
 from failuretwin.connection.student_fit import fit_student
 from failuretwin.core.movements import find_movements
 from failuretwin.core.numerics import Covariance
+from failuretwin.core.runs import RunSet
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.profile import SensorProfile
 from failuretwin.digital_model.sensors import SENSORS, Encoders, Sensor, Tool, sensor_of
 from failuretwin.inference.observation.evidence import rest_begin
 from failuretwin.inference.observation.healthy_model import HealthyModel
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 FAR = 20.0
 """A constant error is looked for within so many times its usual doubt, or its noise."""
@@ -53,14 +50,10 @@ class SensorFit:
     parameters: tuple[Parameter, ...]
 
 
-def fit_sensors(runs: xr.Dataset, model: HealthyModel) -> tuple[SensorFit, ...]:
+def fit_sensors(runs: RunSet, model: HealthyModel) -> tuple[SensorFit, ...]:
     """Return what healthy runs say of every sensor whose readings they hold.
 
     Of the tool's position and of the motors' own readings nothing is learned here.
-
-    Args:
-        runs: Healthy runs.
-        model: Where the healthy robot settles.
     """
     told = (model.imperfections.sensors, model.twin.robot.profile.sensors)
     fits = []
@@ -73,7 +66,7 @@ def fit_sensors(runs: xr.Dataset, model: HealthyModel) -> tuple[SensorFit, ...]:
     return tuple(fits)
 
 
-def _fit(runs: xr.Dataset, model: HealthyModel, sensor: Sensor) -> SensorFit | None:
+def _fit(runs: RunSet, model: HealthyModel, sensor: Sensor) -> SensorFit | None:
     before = sensor.profile or SensorProfile(sensor.kind)
     plain = type(sensor)(sensor.twin, replace(before, bias=()))
     seen, pose, noise, noise_sd = _at_rest(runs, model, plain)
@@ -111,7 +104,7 @@ def _fit(runs: xr.Dataset, model: HealthyModel, sensor: Sensor) -> SensorFit | N
 
 
 def _at_rest(
-    runs: xr.Dataset, model: HealthyModel, sensor: Sensor
+    runs: RunSet, model: HealthyModel, sensor: Sensor
 ) -> tuple[FloatArray, FloatArray, float, float]:
     """Return settled channels (movement, channel), healthy poses (movement, motor), noise.
 

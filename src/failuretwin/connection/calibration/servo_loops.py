@@ -72,13 +72,7 @@ class SharedFit:
 
 
 def fit_shared(steps: Sequence[StepTest], motor: Motor, rad_per_count: float) -> SharedFit:
-    """Fit the motion of one motor.
-
-    Args:
-        steps: Its steps, all without flaw.
-        motor: Its profile.
-        rad_per_count: Size of a count [rad].
-    """
+    """Fit the motion of one motor to steps without flaw."""
     problem = _Problem.of(steps, motor, rad_per_count)
     starts = np.tile(problem.prior, (len(STARTS), 1))
     starts[:, 0] *= [factor for factor, _ in STARTS]
@@ -166,11 +160,7 @@ class _Problem:
         return np.stack([np.clip(grid / max(s.duration, GRID_S), 0.0, 1.0) for s in self.steps])
 
     def predicted(self, values: FloatArray) -> FloatArray:
-        """Return the readings predicted by sets of parameters, (set, reading) [rad].
-
-        Args:
-            values: (set, parameter).
-        """
+        """Return the readings predicted by `values` (set, parameter), (set, reading) [rad]."""
         shared = values[:, :SHARED]
         delay, before, after = np.moveaxis(values[:, SHARED:].reshape(len(values), 3, -1), 1, 0)
         late = shared[:, 4:] + delay
@@ -209,9 +199,7 @@ class _Problem:
     def residuals(self, values: FloatArray, excess: float) -> FloatArray:
         """Return standardised residuals of readings and prior, (residual,).
 
-        Args:
-            values: All parameters, (parameter,).
-            excess: Factor on the variance of readings.
+        `excess` is a factor on the variance of readings.
         """
         misfit = self.predicted(values[None])[0] - self.position
         readings = misfit / (np.sqrt(excess) * self.reading_deviation)

@@ -66,11 +66,6 @@ class SettlingPosterior:
     prior_deviation: FloatArray
 
     @property
-    def motors(self) -> int:
-        """Number of motors."""
-        return (len(self.mode) - 1) // 4
-
-    @property
     def deviation(self) -> FloatArray:
         """Standard deviation of each parameter, (4 n + 1,)."""
         return np.sqrt(np.diag(self.covariance))
@@ -92,12 +87,7 @@ class SortedMovements:
 
     @classmethod
     def of(cls, observations: Observations, model: HealthyModel) -> SortedMovements:
-        """Return what became of movements.
-
-        Args:
-            observations: Settled movements.
-            model: The robot, with the sensors of the observations; it is not in doubt.
-        """
+        """Return what became of movements, as the sensors of a robot beyond doubt saw them."""
         likelihood = RunLikelihood(observations.evidence, model.without_doubt)
         share = likelihood.outcome_probability[observations.at]
         sound = share.sum(axis=-1)
@@ -123,11 +113,6 @@ class SettlingFit:
     def settling(self) -> Settling:
         """Where motors settle, payload included."""
         return replace(self.together.learned.settling, source="fit")
-
-    @property
-    def payload(self) -> float:
-        """Mass at the tool point that the fit knows of [kg]."""
-        return self.settling.payload
 
     @cached_property
     def fit(self) -> SettlingPosterior:
@@ -179,10 +164,7 @@ class SettlingFit:
         return self.sorted.log_likelihood + offsets
 
     def without(self, runs: BoolArray) -> SettlingFit:
-        """Return the fit to the other runs, found from here.
-
-        Args:
-            runs: The runs that it must not have seen, (run,).
+        """Return the fit to all runs but some, a mask (run,), found from here.
 
         Raises:
             InputError: If too few movements are left.
@@ -206,10 +188,7 @@ class SettlingFit:
 
 
 def fit_settling(observations: Observations) -> SettlingFit:
-    """Fit where the motors of a healthy robot settle.
-
-    Args:
-        observations: Settled movements of healthy runs, and what is believed of the robot.
+    """Fit where the motors of a healthy robot settle, by what is believed of it.
 
     Raises:
         InputError: If too few movements are left.
@@ -229,10 +208,6 @@ def fit_settling(observations: Observations) -> SettlingFit:
 
 def fitted_to(observations: Observations, together: RunsTogether) -> SettlingFit:
     """Return what is learned from runs, one pass after the other until nothing moves.
-
-    Args:
-        observations: The movements.
-        together: The same runs; they are learned from.
 
     Raises:
         InputError: If too few movements are left.
@@ -303,7 +278,8 @@ def sense_remarks(part: SettlingFit, robot: Robot) -> list[str]:
     loaded = np.flatnonzero(largest_load(robot, 0.0) > 1e-6)
     elsewhere = _far_if_turned(part, robot)
     best, fit, odds = _best_senses(part, robot, loaded[~elsewhere[loaded]].tolist())
-    sag = np.abs(np.asarray(fit.settling.compliance) * largest_load(best, part.payload))
+    payload = part.settling.payload
+    sag = np.abs(np.asarray(fit.settling.compliance) * largest_load(best, payload))
     remarks = []
     for k, motor in enumerate(robot.motors):
         sense = best.motors[k].sense
@@ -353,7 +329,7 @@ def _best_senses(
     """
     best, fit = robot, part
     while True:
-        turned = {k: _refit(part, _with_turned(best, k), part.payload) for k in loaded}
+        turned = {k: _refit(part, _with_turned(best, k), part.settling.payload) for k in loaded}
         ahead = {k: fit.log_posterior - other.log_posterior for k, other in turned.items()}
         k = min(ahead, key=lambda motor: ahead[motor], default=None)
         if k is None or -ahead[k] <= SURE_NATS:

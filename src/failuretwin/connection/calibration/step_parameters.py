@@ -39,12 +39,7 @@ def overshoot(step: StepTest) -> float:
 
 
 def settling_time(step: StepTest, rad_per_count: float) -> float:
-    """Return the time from the end of the commanded ramp until the motor has settled [s].
-
-    Args:
-        step: The step.
-        rad_per_count: Size of a count [rad].
-    """
+    """Return the time from the end of the commanded ramp until the motor has settled [s]."""
     band = max(BAND_SHARE * abs(step.travel), BAND_COUNTS * rad_per_count)
     away = step.time[np.abs(step.position - step.settled) > 1.001 * band]
     return max(0.0, float(away[-1]) - step.duration) if len(away) else 0.0
@@ -53,9 +48,7 @@ def settling_time(step: StepTest, rad_per_count: float) -> float:
 def mean_interval(values: Sequence[float], blur: Sequence[float]) -> tuple[float, float, float]:
     """Return the mean and the limits of its 95 % interval.
 
-    Args:
-        values: One value per step.
-        blur: Standard deviation of each by rounding.
+    `blur` is the standard deviation of each value by rounding.
     """
     mean, count = float(np.mean(values)), len(values)
     variance, factor = float(np.sum(np.square(blur))) / count**2, 1.96
@@ -100,10 +93,6 @@ def fit_steps(
     steps: Sequence[StepTest], robot: Robot
 ) -> tuple[tuple[StepFit, ...], tuple[LeftOut, ...]]:
     """Fit every motor that has steps without flaw.
-
-    Args:
-        steps: Steps of any of the robot's motors.
-        robot: The robot.
 
     Returns:
         The fits in chain order and the steps left out, each with its reason.
@@ -205,9 +194,7 @@ class LearnedLoops:
 def split_step_tests(logs: Sequence[Path], columns: Path | None) -> tuple[list[Path], list[Path]]:
     """Return step tests, as files, and all other logs; a folder with both kinds counts as both.
 
-    Args:
-        logs: Files and folders.
-        columns: Column map by which other CSV files in a folder are logs; None: they are ignored.
+    Other CSV files in a folder are logs if there is a column map.
 
     Raises:
         InputError: If there are step tests only.

@@ -8,22 +8,19 @@ lag, Gauss-Newton with robust weights finds x_r of every run.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.connection.calibration.settling_fit import SettlingFit
+from failuretwin.connection.calibration.observations import Observations
+from failuretwin.connection.calibration.settling_fit import SortedMovements
 from failuretwin.core.movements import Movements, find_movements
-from failuretwin.core.runs import measured_rate
+from failuretwin.core.runs import RunSet, measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.digital_model.disturbances import lagged
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, sag
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.observation.readings import measured_samples
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 LONGEST_LAG_S = 0.08
 """Longest lag looked for [s]."""
@@ -73,10 +70,7 @@ class Transients:
     def predicted(self, robot: Robot, values: FloatArray, lag: float) -> FloatArray:
         """Return the readings expected, (run, time, motor) [rad] or (run, time, axis) [m].
 
-        Args:
-            robot: The robot.
-            values: Delay [s] and shortening of each run, (run, 2).
-            lag: Lag of the robot [s].
+        `values` are delay [s] and shortening of each run, (run, 2); the lag is the robot's [s].
         """
         twin, (delay, shortening) = DigitalTwin(robot), values.T
         position = motion(self.movements, self.time, twin, delay, shortening, lag) + self.yielding
@@ -92,23 +86,16 @@ class TimingFit:
         shortening: Of each run that tells, (run,).
         lag: Lag of the robot [s].
         doubt: Half 95 % intervals of mean delay [s], mean shortening and lag [s].
-        residual: Typical residual left (1.48 MAD) [rad or m].
     """
 
     delay: FloatArray
     shortening: FloatArray
     lag: float
     doubt: tuple[float, float, float]
-    residual: float
 
 
 def fit_timing(transients: Transients, robot: Robot) -> TimingFit | None:
-    """Fit the timing of a healthy robot; None if fewer than three runs show ramps.
-
-    Args:
-        transients: Readings on the ramps.
-        robot: The robot.
-    """
+    """Fit the timing of a healthy robot; None if fewer than three runs show ramps."""
     from scipy.optimize import minimize_scalar
 
     telling = np.flatnonzero(transients.used.sum(axis=1) >= 12)
@@ -128,14 +115,8 @@ def fit_timing(transients: Transients, robot: Robot) -> TimingFit | None:
     middle = np.clip(lag, LAG_STEP_S, LONGEST_LAG_S - LAG_STEP_S)
     fits = [_fit_runs(ramps, robot, middle + k * LAG_STEP_S, found) for k in (-1.0, 0.0, 1.0)]
     values, costs = (np.stack(part) for part in zip(*fits, strict=True))
-    residual = np.abs(_residual(ramps, robot, found, lag)[ramps.used])
-    return TimingFit(
-        delay=found[:, 0],
-        shortening=found[:, 1],
-        lag=lag,
-        doubt=joint_doubt(values, costs, LAG_STEP_S, float(middle)),
-        residual=float(1.4826 * np.nanmedian(residual)),
-    )
+    doubt = joint_doubt(values, costs, LAG_STEP_S, float(middle))
+    return TimingFit(delay=found[:, 0], shortening=found[:, 1], lag=lag, doubt=doubt)
 
 
 def joint_doubt(
@@ -216,13 +197,9 @@ def motion(
 ) -> FloatArray:
     """Return how motors without load make movements late and short, (run, time, motor) [rad].
 
-    Args:
-        movements: Movements between the angles at which the motors would settle without load.
-        time: Uniform grid, (time,) [s].
-        twin: The servo loops.
-        delay: Dead time of each run, (run,) [s].
-        shortening: Share by which the ramps of each run end early, (run,).
-        lag: Time constant of the lag on top of the servo loops [s].
+    Movements lead to the angles at which motors would settle without load, on a uniform grid
+    (time,) [s]. Delay [s] and shortening of the ramps are those of each run, (run,); the lag [s] is
+    on top of the servo loops.
     """
     moved = replace(
         movements,
@@ -247,51 +224,34 @@ GAP_PERIODS = 4.0
 """A silence of this many periods of the readings is a gap."""
 
 
-@dataclass(frozen=True)
-class Lateness:
-    """Late starts of a stalled bus, read off the times between commands.
+def lateness(movements: Movements) -> FloatArray:
+    """Return how late each movement started, (run, movement) [s]; 0 punctual, NaN not known.
 
-    Attributes:
-        known: Whether commands come at a steady pace, so that lateness can be told.
-        late: How late each movement started, (run, movement) [s]; 0 punctual, NaN not known.
-        period: Usual time from command to command [s].
+    A late start of a stalled bus holds up the next command. Where commands come at no steady pace,
+    nothing is known.
     """
-
-    known: bool
-    late: FloatArray
-    period: float
-
-    @property
-    def delayed(self) -> BoolArray:
-        """Which movements surely started late, (run, movement)."""
-        return np.asarray(self.late > 0.0)
-
-    @property
-    def punctual(self) -> BoolArray:
-        """Which movements surely started on time, (run, movement).
-
-        The last one of a run holds up no other: it is taken for punctual only if all others were.
-        """
-        return np.asarray(self.late == 0.0) if self.delayed.any() else ~self.delayed
-
-
-def lateness(movements: Movements) -> Lateness:
-    """Return how late movements started: a late start holds up the next command."""
     spacing = np.diff(movements.start, axis=1)
     late = np.full(movements.start.shape, np.nan)
     seen = spacing[np.isfinite(spacing)]
     if len(seen) < 3:
-        return Lateness(False, late, float("nan"))
+        return late
     period = float(np.median(seen))
     spread = 1.4826 * float(np.median(np.abs(seen - period)))
-    if spread > STEADY_S:
-        return Lateness(False, late, period)
-    excess = spacing - period
-    late[:, :-1] = np.where(np.isfinite(excess), np.where(excess > LATE_S, excess, 0.0), np.nan)
-    return Lateness(True, late, period)
+    if spread <= STEADY_S:
+        excess = spacing - period
+        late[:, :-1] = np.where(np.isfinite(excess), np.where(excess > LATE_S, excess, 0.0), np.nan)
+    return late
 
 
-def gap_starts(runs: xr.Dataset, movements: Movements, late: FloatArray) -> FloatArray:
+def punctual(late: FloatArray) -> BoolArray:
+    """Return which movements surely started on time by their lateness, (run, movement).
+
+    The last one of a run holds up no other: it is taken for punctual only if all others were.
+    """
+    return np.asarray(late == 0.0) if np.any(late > 0.0) else np.ones(late.shape, dtype=bool)
+
+
+def gap_starts(runs: RunSet, movements: Movements, late: FloatArray) -> FloatArray:
     """Return when readings stop before late starts, after the movement before, (gap,) [s]."""
     time, rate = as_floats(runs["time"].values), measured_rate(runs)
     seen = measured_samples(runs).seen
@@ -310,26 +270,18 @@ def gap_starts(runs: xr.Dataset, movements: Movements, late: FloatArray) -> Floa
 
 
 def transients(
-    runs: xr.Dataset,
+    runs: RunSet,
     movements: Movements,
-    late: Lateness,
-    part: SettlingFit,
+    late: FloatArray,
+    seen: Observations,
+    became: SortedMovements,
     settling: Settling,
     robot: Robot,
 ) -> Transients:
-    """Return the readings on ramps that began on time and at a known place.
-
-    Args:
-        runs: The runs of the observations.
-        movements: Their movements.
-        late: How late they started.
-        part: Sorted settled movements.
-        settling: Where motors settle.
-        robot: The robot.
-    """
+    """Return the readings on ramps that began on time and at a known place."""
     time = as_floats(runs["time"].values)
-    used = _on_time(movements, late, part, time)
-    of_motors = part.observations.of_motors
+    used = _within(movements, _sound(movements, seen, became) & punctual(late), time)
+    of_motors = seen.of_motors
     reading = as_floats(runs["position"].values) if of_motors else measured_samples(runs).point
     free = unloaded_movements(movements, settling)
     if of_motors:
@@ -347,24 +299,21 @@ def transients(
     )
 
 
-def _on_time(
-    movements: Movements, late: Lateness, part: SettlingFit, time: FloatArray
-) -> BoolArray:
-    """Return which times belong to a ramp that began on time at a known place, (run, time)."""
-    on_time = _sound(movements, part) & late.punctual
+def _within(movements: Movements, chosen: BoolArray, time: FloatArray) -> BoolArray:
+    """Return which times belong to the ramps of some movements, (run, time)."""
     used = np.zeros((len(movements.start), len(time)), dtype=bool)
-    for run, movement in np.argwhere(on_time):
+    for run, movement in np.argwhere(chosen):
         begin = movements.start[run, movement]
         end = begin + np.nanmax(movements.ramp_duration[run, movement]) + AFTER_RAMP_S
         used[run] |= (time >= begin) & (time < end)
     return used
 
 
-def _sound(movements: Movements, part: SettlingFit) -> BoolArray:
-    """Return which movements began and ended where the fit says, (run, movement)."""
-    good, seen = np.zeros(movements.start.shape, dtype=bool), part.observations
+def _sound(movements: Movements, seen: Observations, became: SortedMovements) -> BoolArray:
+    """Return which movements began and ended where they should, (run, movement)."""
+    good = np.zeros(movements.start.shape, dtype=bool)
     run, number = seen.at
-    fine = ~part.sorted.odd & ~part.sorted.lost.any(axis=1)
+    fine = ~became.odd & ~became.lost.any(axis=1)
     good[run[fine], number[fine]] = True
     before = np.ones_like(good)
     before[:, 1:] = good[:, :-1]
@@ -382,6 +331,6 @@ def unloaded_movements(movements: Movements, settling: Settling) -> Movements:
     )
 
 
-def movements_of(runs: xr.Dataset) -> Movements:
+def movements_of(runs: RunSet) -> Movements:
     """Return the movements of a run set."""
     return find_movements(as_floats(runs["command"].values), as_floats(runs["time"].values))

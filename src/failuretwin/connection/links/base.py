@@ -214,10 +214,6 @@ class Link(Source):
 
     A full link drops its oldest reading: a lost reading costs little, but a lost command would
     make a healthy robot look faulty.
-
-    Args:
-        name: Name for messages to the user.
-        capacity: Maximum number of waiting events.
     """
 
     name, ended = "", False

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from failuretwin import __version__
 from failuretwin.connection.links.base import Answer, CommandSent, Item, Sink
-from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosWriter
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosTopics, RosWriter
 from failuretwin.connection.links.ros_transport import Outgoing, RosCodec
 from failuretwin.core.errors import InputError, OutputError, needs_extra
 from failuretwin.data_knowledge.readers.bag_messages import GOAL_TOPIC, NS_PER_S
@@ -47,12 +46,7 @@ def _unwritten(path: Path, error: OSError) -> OutputError:
 
 
 def write_bag(path: Path, robot: Robot, commands: Sequence[CommandSent]) -> None:
-    """Write commands as a ROS 1 bag, with the topic and type of recordings.
-
-    Args:
-        path: The file; it must not exist.
-        robot: The robot.
-        commands: In order of time.
+    """Write commands, in order of time, as a ROS 1 bag, with topic and type of recordings.
 
     Raises:
         InputError: If it exists, or rosbags is missing.
@@ -79,10 +73,6 @@ class Recorder(Sink):
 
     If the disk is full or gone, diagnoses wait in memory, readings and commands are dropped, and
     the recorder tries every few seconds to write again.
-
-    Args:
-        path: The file; it must not exist.
-        robot: The robot.
 
     Raises:
         InputError: If it exists, does not end in .mcap, or an extra is missing.

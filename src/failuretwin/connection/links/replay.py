@@ -48,11 +48,9 @@ class Pace:
         self._zero: tuple[float, float] | None = None
 
     def due(self, event_time: float, timeout_s: float) -> bool:
-        """Wait for an event and return whether it is due.
+        """Wait `timeout_s` [s] at most for an event and return whether it is due.
 
-        Args:
-            event_time: Time of the event by the robot's clock [s]; the first one is due at once.
-            timeout_s: Longest time to wait [s].
+        Times are by the robot's clock [s]; the first event is due at once.
         """
         if self.speed == AS_FAST_AS_POSSIBLE:
             return True
@@ -74,13 +72,7 @@ class Wait:
 
 
 class PacedSource(Source):
-    """Source that gives events when they are due and drops none.
-
-    Args:
-        name: Its name.
-        events: Events in the order of their times.
-        pace: Clock of the events.
-    """
+    """Source that gives events, in the order of their times, when they are due, and drops none."""
 
     name, ended, counts = "", False, LinkCounts()
 
@@ -105,13 +97,9 @@ class PacedSource(Source):
 
 
 def replay(path: Path, robot: Robot, pace: Pace, topics: BagTopics | None = None) -> PacedSource:
-    """Return a log as a source.
+    """Return a log as a source: one raw session (a folder), a ROS 1 or ROS 2 bag or an MCAP file.
 
-    Args:
-        path: Folder of one raw session, ROS 1 bag, ROS 2 bag or MCAP file.
-        robot: The robot of the log.
-        pace: Clock of the events.
-        topics: Roles of a bag's topics, for bags whose types do not settle them.
+    `topics` are the roles of a bag's topics, where types do not settle them.
 
     Raises:
         InputError: If it does not exist, cannot be read, or holds several sessions.

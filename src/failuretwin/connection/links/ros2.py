@@ -71,10 +71,6 @@ class Ros2Transport(Transport):
     Types are known by the key of a message. Those of ROS have their own fields, all others the
     fields of the authors' message, because Zenoh sends no definitions along.
 
-    Args:
-        host: Host of the router.
-        port: Its port.
-
     Raises:
         InputError: If an extra is missing, ``ROS_DOMAIN_ID`` is invalid, or no router answers.
     """

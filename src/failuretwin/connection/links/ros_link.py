@@ -20,8 +20,12 @@ from failuretwin.connection.links.base import (
 )
 from failuretwin.connection.links.ros1 import Ros1Transport
 from failuretwin.connection.links.ros2 import ROUTER_PORT, Ros2Transport
-from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosReader, RosWriter
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_messages import (
+    DiagnosticsWriter,
+    RosReader,
+    RosTopics,
+    RosWriter,
+)
 from failuretwin.connection.links.ros_transport import Decode, Transport
 from failuretwin.connection.links.rosbridge import BRIDGE_PORT, RosbridgeTransport
 from failuretwin.core.errors import InputError

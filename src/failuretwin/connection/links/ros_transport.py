@@ -46,9 +46,6 @@ class RosCodec:
 
     A type that is not part of ROS gets the fields of the authors' message.
 
-    Args:
-        ros: Version of ROS.
-
     Raises:
         InputError: If rosbags is not installed.
     """
@@ -85,11 +82,7 @@ class RosCodec:
     def decode(self, data: bytes, type_: str, definition: str = "") -> tuple[Any, Kind]:
         """Return a message as an object with the fields of its kind, and its kind.
 
-        Args:
-            data: The message.
-            type_: Its type.
-            definition: Definition of the type by its publisher, with all types in it; empty: as
-                known here.
+        `definition` is that of the type by its publisher, with all types in it; empty: as known.
 
         Raises:
             InputError: If the type is of no known kind.

@@ -28,10 +28,6 @@ _ROS1_TIME = {"secs": "sec", "nsecs": "nanosec"}
 class RosbridgeTransport(Transport):
     """Client of a rosbridge server, by roslibpy, which reconnects and subscribes again by itself.
 
-    Args:
-        host: Host of the server.
-        port: Its port.
-
     Raises:
         InputError: If roslibpy is missing or no server answers.
     """

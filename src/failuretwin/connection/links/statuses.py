@@ -66,10 +66,6 @@ def statuses(answer: Answer, motors: Sequence[str]) -> list[Status]:
 
     The alarm decides the states, whatever the probabilities are. Without data every status is
     stale, with the last known state in its message.
-
-    Args:
-        answer: The answer.
-        motors: Names of the robot's motors in chain order.
     """
     names = ["arm", *motors]
     diagnosis = answer.diagnosis

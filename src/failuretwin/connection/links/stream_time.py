@@ -44,12 +44,9 @@ class StreamClock:
         self._leap, self._leaps = np.nan, 0
 
     def to_stream_time(self, stamp: float, now_s: float, reading: bool = False) -> float:
-        """Return the stream time of an event [s].
+        """Return the stream time of an event [s], by its stamp and our own monotonic clock [s].
 
-        Args:
-            stamp: Its stamp by the robot's clock [s].
-            now_s: Our own monotonic clock [s].
-            reading: Whether it is a reading; commands may be late.
+        A reading shows a clock that was set back; a command may just be late.
         """
         if self._offset is None:
             self._offset, self._seen_s = -stamp, now_s
@@ -73,8 +70,7 @@ class StreamClock:
     def _keeps_leaping(self, offset: float) -> bool:
         """Return whether `SET_EVENTS` events have jumped alike.
 
-        Args:
-            offset: Stream time by our own clock minus the stamp [s].
+        `offset` is stream time by our own clock minus the stamp [s].
         """
         alike = abs(offset - self._leap) <= BACK_S
         self._leaps, self._leap = self._leaps + 1 if alike else 1, offset
@@ -116,8 +112,7 @@ def order(event: Event) -> tuple[float, bool]:
 class ReorderBuffer:
     """Buffer that puts late events into the order of their times.
 
-    Args:
-        hold_s: Time that events are held back [s]; 0: only those of the future.
+    Events are held back for `hold_s` [s]; 0: only those of the future.
     """
 
     def __init__(self, hold_s: float = 0.0) -> None:

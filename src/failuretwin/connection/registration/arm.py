@@ -23,9 +23,8 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
-from failuretwin.connection.registration.poses import Poses
 from failuretwin.connection.student_fit import StudentFit, fit_student
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.geometry import (
     NO_OFFSET,
     Geometry,
@@ -38,7 +37,7 @@ from failuretwin.digital_model.geometry import (
 from failuretwin.digital_model.kinematics import Loads, SerialChain, rotation_to_z
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import poses_in_range
-from failuretwin.digital_model.urdf.file import Triple, UrdfJoint, read_urdf, transform
+from failuretwin.digital_model.urdf.file import Triple, Urdf, read_urdf, transform
 from failuretwin.inference.set_ups.registration import Frame
 
 # Standard deviations of what is believed before any pose is seen.
@@ -61,6 +60,33 @@ LEAST_LOAD_NM = 1e-6
 
 ANGLES = ("roll", "pitch", "yaw")
 """What the turn of the base is told in; it is fitted about the sensor's x, y and z."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Where the tool rested.
+
+    Attributes:
+        target: Commanded angles, (pose, motor) [rad], log's sense.
+        point: Settled tool positions, (pose, 3) [m], in the sensor's frame.
+    """
+
+    target: FloatArray
+    point: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.target)
+
+    def __getitem__(self, kept: IntArray | slice) -> Poses:
+        """Return some of the poses."""
+        return Poses(self.target[kept], self.point[kept])
+
+    def spread(self, count: int) -> Poses:
+        """Return as many of the poses at most, evenly over all."""
+        if len(self) <= count:
+            return self
+        return self[np.rint(np.linspace(0, len(self) - 1, count)).astype(int)]
 
 
 @dataclass(frozen=True)
@@ -115,31 +141,29 @@ class Start:
 
 @dataclass(frozen=True)
 class Arm:
-    """An arm by its URDF, with the tool point of its profile.
+    """An arm by its URDF, with the tool point of its profile, which says nothing else of geometry.
 
     Attributes:
         robot: The robot.
-        urdf_joints: Its moving joints as the URDF states them, base to tool.
-        chain: Its chain in the frame of the base link, to the tool link.
     """
 
     robot: Robot
-    urdf_joints: tuple[UrdfJoint, ...]
-    chain: SerialChain
-
-    @classmethod
-    def of(cls, robot: Robot) -> Arm:
-        """Return the arm of a robot without what its profile says of geometry."""
-        urdf, profile = read_urdf(robot.urdf_file), robot.profile
-        names = [motor.joint for motor in robot.motors]
-        by_name = {joint.name: joint for joint in urdf.joints}
-        chain = urdf.chain(profile.base_link, profile.tool_link, names)
-        return cls(robot, tuple(by_name[name] for name in names), chain)
 
     @property
     def motors(self) -> int:
         """Number of motors."""
-        return len(self.urdf_joints)
+        return len(self.robot.motors)
+
+    @cached_property
+    def urdf(self) -> Urdf:
+        """The URDF."""
+        return read_urdf(self.robot.urdf_file)
+
+    @cached_property
+    def chain(self) -> SerialChain:
+        """Chain in the frame of the base link, to the tool link."""
+        profile, names = self.robot.profile, [motor.joint for motor in self.robot.motors]
+        return self.urdf.chain(profile.base_link, profile.tool_link, names)
 
     @cached_property
     def slides(self) -> list[bool]:
@@ -182,8 +206,7 @@ class Arm:
     @cached_property
     def gravity(self) -> Loads:
         """What the motors carry, as the URDF has it."""
-        urdf = read_urdf(self.robot.urdf_file)
-        return urdf.loads(self.robot.profile.base_link, self.chain)
+        return self.urdf.loads(self.robot.profile.base_link, self.chain)
 
     def torque(self, target: FloatArray, start: Start) -> FloatArray:
         """Return the torque of gravity in poses, (pose, motor) [N m], driving the seen joint up.
@@ -307,50 +330,33 @@ class Fitted:
         return self.chain.position(self.start.sense * target + sag * torque)
 
     def geometry(self, noise_m: float, source: str) -> Geometry:
-        """Return it as a profile says it.
-
-        Args:
-            noise_m: What is left unexplained on each axis [m].
-            source: Where the figures come from.
-        """
+        """Return it as a profile says it; `noise_m` is left unexplained on each axis [m]."""
         joints = tuple(self._correction(j) for j in range(self.arm.motors))
         return Geometry(joints, self.scale, noise_m, source)
 
     def _correction(self, j: int) -> JointCorrection:
-        joint = self.arm.urdf_joints[j]
-        turn = np.eye(4)
-        turn[:3, :3] = rotation_to_z(joint.axis)
+        name, turn = self.arm.chain.joints[j].name, np.eye(4)
+        axis = next(joint.axis for joint in self.arm.urdf.joints if joint.name == name)
+        turn[:3, :3] = rotation_to_z(axis)
         T = turn @ _across(self.moved(j)) @ turn.T
-        return JointCorrection(
-            joint.name, self.zero(j), _triple(T[:3, 3]), roll_pitch_yaw(T[:3, :3])
-        )
+        return JointCorrection(name, self.zero(j), _triple(T[:3, 3]), roll_pitch_yaw(T[:3, :3]))
 
 
 @dataclass(frozen=True)
-class Posterior:
-    """An arm fitted to poses.
+class Posterior(Fitted):
+    """The most probable arm by poses.
 
     Attributes:
-        fitted: Its most probable numbers.
         told: The fit, in units of what was believed before and metres.
     """
 
-    fitted: Fitted
     told: StudentFit
 
 
 def fit(
     arm: Arm, start: Start, unknowns: Unknowns, poses: Poses, begin: FloatArray | None = None
 ) -> Posterior:
-    """Return an arm fitted to poses.
-
-    Args:
-        arm: The arm.
-        start: Senses, zeros and frame to start from.
-        unknowns: What is asked.
-        poses: Settled poses.
-        begin: Numbers to begin at, (unknown,); None: 0.
-    """
+    """Return an arm fitted to poses, from `start` and numbers `begin` (unknown,); None: 0."""
     spread, torque = unknowns.spread, arm.torque(poses.target, start)
 
     def residual(x: FloatArray) -> FloatArray:
@@ -359,7 +365,7 @@ def fit(
 
     begin = np.zeros(len(unknowns)) if begin is None else begin
     told = fit_student(residual, begin / spread, 3)
-    return Posterior(Fitted(arm, start, unknowns, told.value * spread), told)
+    return Posterior(arm, start, unknowns, told.value * spread, told)
 
 
 def _triple(values: FloatArray) -> Triple:

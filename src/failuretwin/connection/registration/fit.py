@@ -5,26 +5,31 @@ Section: docs/another_arm.md#fit-the-frame-and-the-geometry
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from failuretwin.connection.calibration.result import Parameter
-from failuretwin.connection.registration.arm import Arm, Fitted, Posterior, fit
-from failuretwin.connection.registration.poses import Poses, settled_poses
-from failuretwin.connection.registration.search import Registered, search
+from failuretwin.connection.registration.arm import Arm, Fitted, Poses, Posterior, fit
+from failuretwin.connection.registration.search import search
 from failuretwin.core.errors import InputError
-from failuretwin.core.runs import check_motors
+from failuretwin.core.runs import RunSet, check_motors, truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.digital_model.profile import Profile
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.settings import InferenceSettings
 from failuretwin.inference.set_ups.registration import align
 from failuretwin.inference.set_ups.set_ups import SetUp, extent, gross_unit, mistakes
 from failuretwin.inference.set_ups.wrong_setup import NEAR, wrong_setup
 
+FEWEST = 8
+"""Settled poses below which no frame is fitted: with six numbers of the frame and three of the tool
+that leaves one or two poses to tell a bad one by."""
 LEARNED = 0.5
 """A number is identified if poses bring its deviation below this share of the prior's."""
 NOT_TOLD = 0.7
@@ -89,55 +94,72 @@ def fit_registration(
 def register(poses: Poses, robot: Robot, source: str = "", date: str = "") -> Registration:
     """Fit frames, tool point, senses, zeros and geometry to settled poses.
 
-    Args:
-        poses: The poses.
-        robot: The robot.
-        source: Where they come from.
-        date: When it is done.
-
     Raises:
         InputError: As `fit_registration`.
     """
-    arm = Arm.of(robot)
+    arm = Arm(robot)
     _refuse_units(poses, robot)
-    found = search(arm, poses)
-    _refuse_misfit(found.best, poses, robot)
-    whole = _with_details(arm, found.best, poses)
-    fitted = whole.fitted
+    best, others = search(arm, poses)
+    _refuse_misfit(best, poses, robot)
+    whole = _with_details(arm, best, poses)
     when = f" on {date}" if date else ""
     told = f"failuretwin robot fit{when}: {len(poses)} settled poses"
     told += f" of {source}" if source else ""
     return Registration(
-        profile=_profile(robot, fitted, whole.told.noise, told),
+        profile=_profile(robot, whole, told),
         parameters=_parameters(whole),
         poses=len(poses),
         before_mm=_middle_mm(poses.point - DigitalTwin(robot).path(poses.target)),
-        frames_mm=_middle_mm(_error(found.best, poses)),
+        frames_mm=_middle_mm(_error(best, poses)),
         after_mm=_unseen_mm(arm, whole, poses),
         noise_m=whole.told.noise,
         not_told=tuple(_not_told(whole)),
-        remarks=tuple(_remarks(robot, found, whole, poses)),
+        remarks=tuple(_remarks(robot, others, whole, poses)),
     )
+
+
+def settled_poses(runs: RunSet, robot: Robot) -> Poses:
+    """Return the settled poses of healthy runs; runs that are labelled faulty are left out.
+
+    Nothing but commands and tool positions is read.
+
+    Raises:
+        InputError: If there are too few.
+    """
+    truth = truth_of(runs)
+    if truth is not None:
+        runs = runs.isel(run=[i for i, fault in enumerate(truth) if fault == "healthy"])
+    count = 0
+    if runs.sizes["run"]:
+        settled = Evidence(runs, InferenceSettings.of(robot)).sound.settled
+        usable = settled.usable
+        count = int(usable.sum())
+    if count < FEWEST:
+        unknowns = 4 * len(robot.motors) + 3
+        raise InputError(
+            f"the logs hold {count} poses in which a healthy arm rests, expected {FEWEST} at least "
+            f"for frame and tool point, and {2 * unknowns} or more for the geometry of "
+            f"{len(robot.motors)} joints. Let the arm rest in more poses, all over its range."
+        )
+    return Poses(settled.movements.target[usable], settled.point[usable])
 
 
 def _with_details(arm: Arm, found: Posterior, poses: Poses) -> Posterior:
     unknowns = arm.details()
     begin = np.zeros(len(unknowns))
-    begin[: len(found.fitted.values)] = found.fitted.values
-    return fit(arm, found.fitted.start, unknowns, poses, begin)
+    begin[: len(found.values)] = found.values
+    return fit(arm, found.start, unknowns, poses, begin)
 
 
 def _error(found: Posterior, poses: Poses) -> FloatArray:
-    fitted = found.fitted
-    torque = fitted.arm.torque(poses.target, fitted.start)
-    return poses.point - fitted.expected(poses.target, torque)
+    torque = found.arm.torque(poses.target, found.start)
+    return poses.point - found.expected(poses.target, torque)
 
 
 def _unseen_mm(arm: Arm, whole: Posterior, poses: Poses) -> float:
     """Return the error of every fifth pose by a fit to the others, which begins at `whole` [mm]."""
     fold = np.arange(len(poses)) % FOLDS == FOLDS - 1
-    fitted = whole.fitted
-    others = fit(arm, fitted.start, fitted.unknowns, poses[np.flatnonzero(~fold)], fitted.values)
+    others = fit(arm, whole.start, whole.unknowns, poses[np.flatnonzero(~fold)], whole.values)
     return _middle_mm(_error(others, poses[np.flatnonzero(fold)]))
 
 
@@ -185,7 +207,7 @@ def _swapped(robot: Robot, poses: Poses, away: float) -> SetUp | None:
 # What was found, as a profile and in words.
 
 
-def _profile(robot: Robot, fitted: Fitted, noise: float, source: str) -> Profile:
+def _profile(robot: Robot, fitted: Posterior, source: str) -> Profile:
     """Return the profile with what was fitted; the pose that is seen changes with senses alone."""
     profile, sense = robot.profile, fitted.start.sense
     if not np.array_equal(sense, robot.sensor_sense):
@@ -197,7 +219,7 @@ def _profile(robot: Robot, fitted: Fitted, noise: float, source: str) -> Profile
         profile,
         tool_xyz=fitted.tool_xyz,
         base_xyz_rpy=fitted.base_xyz_rpy,
-        geometry=fitted.geometry(noise, source),
+        geometry=fitted.geometry(fitted.told.noise, source),
         imperfections=None,
     )
 
@@ -214,11 +236,11 @@ STEP = 1e-5
 
 def _parameters(found: Posterior) -> tuple[Parameter, ...]:
     """Return the stated numbers with their intervals (delta method)."""
-    slopes = _slopes(found.fitted)
+    slopes = _slopes(found)
     deviations = np.sqrt(np.einsum("nu,uv,nv->n", slopes, found.told.covariance, slopes))
     priors = np.linalg.norm(slopes, axis=1)
     rows = []
-    for one, deviation, prior in zip(_stated(found.fitted), deviations, priors, strict=True):
+    for one, deviation, prior in zip(_stated(found), deviations, priors, strict=True):
         if prior < 1e-9:  # fixed: no unknown moves it
             continue
         learned = bool(deviation < LEARNED * prior)
@@ -277,7 +299,7 @@ def _not_told(found: Posterior) -> list[str]:
         if deviation < NOT_TOLD:
             break
         parts = np.flatnonzero(np.abs(way) > MAIN_PART)
-        names = dict.fromkeys(_spoken(found.fitted, int(i)) for i in parts)
+        names = dict.fromkeys(_spoken(found, int(i)) for i in parts)
         sentences.append(" against ".join(names) if len(names) > 1 else "".join(names))
     return sentences
 
@@ -290,12 +312,14 @@ def _spoken(fitted: Fitted, index: int) -> str:
     return f"{what} of {fitted.arm.robot.motors[unknown.motor].joint}"
 
 
-def _remarks(robot: Robot, found: Registered, whole: Posterior, poses: Poses) -> list[str]:
-    names, sense = robot.motor_names, whole.fitted.start.sense
+def _remarks(
+    robot: Robot, others: Sequence[Posterior], whole: Posterior, poses: Poses
+) -> list[str]:
+    names, sense = robot.motor_names, whole.start.sense
     turned = [n for n, now, was in zip(names, sense, robot.sensor_sense, strict=True) if now != was]
     remarks = [f"{name} turns the other way than the profile said" for name in turned]
-    remarks += [_either(names, sense, other) for other in found.others]
-    unknowns = len(whole.fitted.unknowns)
+    remarks += [_either(names, sense, other) for other in others]
+    unknowns = len(whole.unknowns)
     if 3 * len(poses) < 6 * unknowns:
         remarks.append(
             f"{len(poses)} poses for {unknowns} unknowns: {2 * unknowns} poses all over the range "
@@ -311,8 +335,8 @@ def _remarks(robot: Robot, found: Registered, whole: Posterior, poses: Poses) ->
 
 def _either(names: list[str], sense: FloatArray, other: Posterior) -> str:
     """Return a sentence on another way to see the arm, and on what decides."""
-    differ = [n for n, a, b in zip(names, sense, other.fitted.start.sense, strict=True) if a != b]
-    up = "up" if other.fitted.turn[2, 2] > 0.0 else "down"
+    differ = [n for n, a, b in zip(names, sense, other.start.sense, strict=True) if a != b]
+    up = "up" if other.turn[2, 2] > 0.0 else "down"
     return (
         f"either as fitted, or with {', '.join(differ)} turning the other way and the base's z "
         f"pointing {up} for the sensor: the poses cannot tell. Move {differ[0]} by hand or alone "

@@ -10,13 +10,11 @@ Section: docs/inference.md#calibration-and-geometry
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import combinations, product
 
 import numpy as np
 
-from failuretwin.connection.registration.arm import Arm, Posterior, Start, fit
-from failuretwin.connection.registration.poses import Poses
+from failuretwin.connection.registration.arm import Arm, Poses, Posterior, Start, fit
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.geometry import with_tool
 from failuretwin.inference.set_ups.registration import Frame, align
@@ -48,21 +46,11 @@ STARTS, SWEEPS = 6, 3
 SEED = 0
 
 
-@dataclass(frozen=True)
-class Registered:
-    """What a search found.
+def search(arm: Arm, poses: Poses) -> tuple[Posterior, list[Posterior]]:
+    """Return senses, zeros and frame that bring settled poses together.
 
-    Attributes:
-        best: The most probable arm; frame, tool point and zeros fitted.
-        others: Arms that the poses cannot tell from it.
+    They are those of the most probable arm, then of others that the poses cannot tell from it.
     """
-
-    best: Posterior
-    others: tuple[Posterior, ...]
-
-
-def search(arm: Arm, poses: Poses) -> Registered:
-    """Return senses, zeros and frame that bring settled poses together."""
     few = poses.spread(COARSE_POSES)
     ranked = _ranked(arm, few)
     if ranked[0].frame.away > NEAR * extent(few.point):
@@ -71,11 +59,11 @@ def search(arm: Arm, poses: Poses) -> Registered:
     best = max(found, key=lambda one: _score(arm, one))
     found += [_registered(arm, one, few) for one in _one_turned(arm, few, best)]
     found.sort(key=lambda one: one.told.log_likelihood)
-    known = {tuple(one.fitted.start.sense.tolist()): one for one in found}
+    known = {tuple(one.start.sense.tolist()): one for one in found}
     order = sorted(known.values(), key=lambda one: -_score(arm, one))
     top = order[0]
     ties = [f for f in order[1:] if f.told.log_likelihood > top.told.log_likelihood - SURE_NATS]
-    return Registered(_registered(arm, _as_start(top), poses), tuple(ties))
+    return _registered(arm, _as_start(top), poses), ties
 
 
 def _fitted(arm: Arm, starts: list[Start], poses: Poses) -> list[Posterior]:
@@ -88,15 +76,14 @@ def _fitted(arm: Arm, starts: list[Start], poses: Poses) -> list[Posterior]:
 def _score(arm: Arm, found: Posterior) -> float:
     """Return the log posterior of senses: the profile's own, and a base that is upright."""
     own = arm.robot.sensor_sense
-    turned = int(np.sum(found.fitted.start.sense != own))
-    upright = found.fitted.turn[2, 2] > 0.0
+    turned = int(np.sum(found.start.sense != own))
+    upright = found.turn[2, 2] > 0.0
     return found.told.log_likelihood - TURN_NATS * turned + TURN_NATS * upright
 
 
 def _as_start(found: Posterior) -> Start:
-    fitted = found.fitted
-    zero = np.array([fitted.zero(j) for j in range(fitted.arm.motors)])
-    return Start(fitted.start.sense, zero, Frame(fitted.turn, fitted.origin, found.told.sigma))
+    zero = np.array([found.zero(j) for j in range(found.arm.motors)])
+    return Start(found.start.sense, zero, Frame(found.turn, found.origin, found.told.sigma))
 
 
 def _registered(arm: Arm, start: Start, poses: Poses) -> Posterior:

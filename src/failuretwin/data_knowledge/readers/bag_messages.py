@@ -94,13 +94,7 @@ def kind_of_type(type_: str) -> Kind:
 
 
 def check_role(role: Role, kind: Kind | None, what: str) -> None:
-    """Raise InputError unless messages of a kind can play a role.
-
-    Args:
-        role: The role.
-        kind: The kind; None: one that is not understood.
-        what: The topic or type, with its verb, for the error text.
-    """
+    """Raise InputError unless messages of a kind can play a role; the text begins with `what`."""
     if kind not in KINDS[role]:
         expected = ", ".join(kind.value for kind in KINDS[role])
         raise InputError(f"{what} cannot be the {role}. Expected {expected}.")
@@ -172,11 +166,7 @@ class Rows:
 def topic_rows(messages: Sequence[BagMessage], kind: Kind, role: Role, where: str) -> Rows:
     """Return the values in the messages of one topic; tool positions without a value are left out.
 
-    Args:
-        messages: The messages.
-        kind: Their kind.
-        role: Their role; the authors' message carries durations if it is ``command``.
-        where: File and topic for error texts.
+    The authors' message carries durations if its role is ``command``.
 
     Raises:
         InputError: If names and values do not fit together or a time makes no sense.

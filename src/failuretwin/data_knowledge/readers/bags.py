@@ -41,10 +41,8 @@ CLOCK_GAP_NS = 3600 * NS_PER_S
 def read_bag(path: Path, robot: Robot, topics: BagTopics | None = None) -> TimedLog:
     """Read a ROS 1 bag (.bag), a ROS 2 bag (folder or .db3) or an MCAP file.
 
-    Args:
-        path: The file or folder.
-        robot: The robot it is of. Joints that it does not have are ignored.
-        topics: Which topics to read; by default those whose type and name fit.
+    Joints that the robot does not have are ignored. Without `topics` those are read whose type and
+    name fit.
 
     Returns:
         One log, named after the file; its time counts from its first stamp.
@@ -71,10 +69,6 @@ def read_bag(path: Path, robot: Robot, topics: BagTopics | None = None) -> Timed
 
 def read_targets(path: Path, robot: Robot) -> Targets | None:
     """Read targets from a bag that holds commands alone, such as `failuretwin design` writes.
-
-    Args:
-        path: The file or folder.
-        robot: The robot it is of.
 
     Returns:
         The targets, their times from the first; None: it holds readings too, or no targets.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -70,7 +70,7 @@ def _guess(path: Path, robot: Robot) -> tuple[ColumnMap, list[str], list[str]]:
         questions, none where the names answer all of them.
     """
     separator = separator_of(path)
-    table = _Guessed(Table.read(path, separator))
+    table = _Guessed.read(path, separator)
     found = _candidates(table.words, robot)
     first = {part: _firsts(candidates) for part, candidates in found.items()}
     command, position, tool = first[COMMAND], first[READING], first[PLACE]
@@ -100,25 +100,22 @@ def _guess(path: Path, robot: Robot) -> tuple[ColumnMap, list[str], list[str]]:
     return columns, list(table.words), doubts
 
 
-@dataclass(frozen=True)
-class _Guessed:
-    """What names and numbers of a table's columns suggest."""
-
-    table: Table
+class _Guessed(Table):
+    """A table, and what names and numbers of its columns suggest."""
 
     @cached_property
     def words(self) -> dict[str, set[str]]:
         """Words of each column's name."""
-        return {name: _words(name) for name in self.table.names}
+        return {name: _words(name) for name in self.names}
 
     def largest(self, columns: Sequence[str]) -> float:
         """Return the largest magnitude in some columns."""
-        return float(np.nanmax(np.abs(self.table.values(columns)), initial=0.0))
+        return float(np.nanmax(np.abs(self.values(columns)), initial=0.0))
 
     def increasing(self) -> str:
         """Return the first column whose numbers only grow, or an empty text."""
         for name in self.words:
-            values = self.table.values([name])[:, 0]
+            values = self.values([name])[:, 0]
             if len(values) > 1 and np.all(np.diff(values) > 0):
                 return name
         return ""
@@ -143,7 +140,7 @@ class _Guessed:
         """Return the unit of the times: stated, or by their size and step."""
         if not column:
             return "s"
-        named, values = self.named_unit([column], TIME_NAMES), self.table.values([column])[:, 0]
+        named, values = self.named_unit([column], TIME_NAMES), self.values([column])[:, 0]
         if named or not np.isfinite(values).any():
             return named or "iso"
         for limit, unit in ((1e17, "ns"), (1e14, "us"), (1e11, "ms")):
@@ -154,7 +151,7 @@ class _Guessed:
 
     def duration_unit(self, columns: Sequence[str]) -> str:
         """Return the unit of the times to reach targets."""
-        long = len(columns) > 0 and np.nanmedian(self.table.values(columns)) > 50.0
+        long = len(columns) > 0 and np.nanmedian(self.values(columns)) > 50.0
         return self.named_unit(columns, TIME_NAMES) or ("ms" if long else "s")
 
     def angle_unit(self, columns: Sequence[str], robot: Robot) -> str:
@@ -162,7 +159,7 @@ class _Guessed:
         named = self.named_unit(columns, ANGLE_NAMES)
         if named or not columns:
             return named or "rad"
-        size = float(np.nanmedian(np.abs(self.table.values(columns))))
+        size = float(np.nanmedian(np.abs(self.values(columns))))
         if robot.profile.servo_units is not None and size > 180.0:
             return SERVO
         return "deg" if self.largest(columns) > LARGEST_RAD else "rad"

@@ -69,8 +69,7 @@ class TimeColumn:
 
 def _present(time: FloatArray, values: FloatArray) -> Samples:
     """Return the rows that hold any value."""
-    filled = np.isfinite(values).any(axis=1)
-    return Samples(time[filled], values[filled])
+    return Samples(time, values).take(np.asarray(np.isfinite(values).any(axis=1)))
 
 
 @dataclass(frozen=True)
@@ -103,11 +102,9 @@ class AngleColumns:
             check_entries(name, len(getattr(self, name)) or len(robot.motors), robot, where)
 
     def to_robot(self, values: FloatArray, robot: Robot) -> FloatArray:
-        """Return angles in the robot's sense [rad, m of a slide]; NaN for counts out of range.
+        """Return logged angles (row, motor) in the robot's sense [rad, m of a slide].
 
-        Args:
-            values: As logged, (row, motor).
-            robot: The robot.
+        NaN stands for counts out of range.
         """
         if self.unit == SERVO:
             units = robot.servo_units
@@ -302,10 +299,7 @@ def _check_distinct(columns: Sequence[str], where: str) -> None:
 def map_text(title: str, hints: str, content: ColumnMap | Mapping[str, Any]) -> str:
     """Return a guessed map as TOML, under comments that say how to check it.
 
-    Args:
-        title: First words of the comments, which name the log.
-        hints: Further comments, any number of lines.
-        content: The map; what is unknown or empty is left out.
+    The comments begin with `title`, which names the log. What is unknown or empty is left out.
     """
     table = asdict(content) if isinstance(content, ColumnMap) else content
     comments = [f"{title}. A GUESS: check every line.", *hints.splitlines()]

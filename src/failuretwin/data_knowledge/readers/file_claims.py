@@ -32,12 +32,10 @@ TEXT_CELL_BYTES = 64
 # NetCDF: HDF5 with conventions.
 
 
-def check_netcdf(path: Path, most_runs: int | None = None) -> None:
+def check_netcdf(path: Path, most_runs: int | None) -> None:
     """Raise InputError unless the arrays of a NetCDF file can be meant and lie in it alone.
 
-    Args:
-        path: The file.
-        most_runs: The most runs that are in memory at a time; None: all.
+    `most_runs` are in memory at a time; None: all.
     """
     import h5py
 
@@ -78,12 +76,10 @@ MAY_BE_EMPTY = ("onset", "magnitude", "position", "temperature", "voltage")
 """Variables that may be unknown throughout; other writers leave out chunks that are all unknown."""
 
 
-def check_zarr(path: Path, most_runs: int | None = None) -> None:
+def check_zarr(path: Path, most_runs: int | None) -> None:
     """Raise InputError unless a Zarr store has only known codecs, sane sizes and all its chunks.
 
-    Args:
-        path: The store.
-        most_runs: The most runs that are in memory at a time; None: all.
+    `most_runs` are in memory at a time; None: all.
     """
     import zarr
 

@@ -49,6 +49,12 @@ def is_lerobot(path: Path) -> bool:
     return (path / INFO_FILE).is_file()
 
 
+def find_lerobot(folder: Path) -> list[Path]:
+    """Return the LeRobot data sets at or below a folder, in order of their names."""
+    infos = sorted(files_below(folder, INFO_FILE.name))
+    return [file.parents[1] for file in infos if file.parent.name == INFO_FILE.parent.name]
+
+
 @dataclass(frozen=True)
 class LeRobotEpisodes:
     """Episodes of a LeRobot data set.
@@ -69,12 +75,9 @@ class LeRobotEpisodes:
 
 
 def read_lerobot(path: Path, robot: Robot, angles: LeRobotAngles | None = None) -> LeRobotEpisodes:
-    """Read the episodes of a LeRobot data set, one log each.
+    """Read the episodes of a LeRobot data set, a folder, one log each.
 
-    Args:
-        path: Its folder.
-        robot: The robot it is of; channels of joints that it does not have are left out.
-        angles: What is known of the unit and sense of the numbers; None: nothing.
+    Channels of joints that the robot does not have are left out.
 
     Raises:
         InputError: If pyarrow is missing, or the data set cannot be read or lacks a joint.

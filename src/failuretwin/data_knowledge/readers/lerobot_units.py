@@ -125,13 +125,8 @@ def found_angles(
 ) -> tuple[LeRobotAngles, str]:
     """Return the meaning of a data set's numbers, complete, and a phrase on how it is known.
 
-    Args:
-        info: ``meta/info.json``.
-        names: Names of the motors' channels, in chain order.
-        state: Readings, (frame, motor), as recorded.
-        path: Folder of the data set.
-        robot: The robot.
-        known: What the user states.
+    `names` and `state` are channels (in chain order) and readings (frame, motor) as recorded,
+    `known` is what the user states.
 
     Raises:
         InputError: If a calibration file is wrong, or several lie in the folder.

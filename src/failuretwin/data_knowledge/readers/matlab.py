@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from failuretwin.core.errors import InputError, needs_extra, unknown_name
 from failuretwin.core.foreign import as_cell, files_below, reading
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements, find_movements
-from failuretwin.core.runs import AXES, RunTable, Truth, truth_of
+from failuretwin.core.runs import AXES, RunSet, RunTable, Truth, truth_of
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.readers.file_claims import check_matlab
 from failuretwin.data_knowledge.readers.raw_sessions import READING_RATE_HZ, published_onset
@@ -29,9 +29,6 @@ from failuretwin.data_knowledge.recovery import recover_movements
 from failuretwin.data_knowledge.store import SUFFIXES, filling, replacing, save_run_set
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 CELL_ARRAYS = (("X_test_array", "y_test_array"), ("X_array", "y_array"))
 """Names of the runs and of their labels in cell-array files."""
@@ -282,7 +279,7 @@ def _split_paths(values: Any, where: str) -> tuple[FloatArray, FloatArray]:
 UNLABELLED = "Unlabelled"
 
 
-def export_runs(runs: xr.Dataset, path: Path, twin: DigitalTwin) -> None:
+def export_runs(runs: RunSet, path: Path, twin: DigitalTwin) -> None:
     """Write a run set in the layout that the name of `path` asks for.
 
     Args:
@@ -315,7 +312,7 @@ def check_export_suffix(path: Path) -> None:
         )
 
 
-def write_cell_array(runs: xr.Dataset, path: Path, twin: DigitalTwin) -> None:
+def write_cell_array(runs: RunSet, path: Path, twin: DigitalTwin) -> None:
     """Write all runs to one file with `X_test_array` and `y_test_array`, 1 x N cells."""
     labels = _labels(runs)
     content = {
@@ -326,7 +323,7 @@ def write_cell_array(runs: xr.Dataset, path: Path, twin: DigitalTwin) -> None:
         partial.write_bytes(_matlab_bytes(content))
 
 
-def write_pairs(runs: xr.Dataset, folder: Path, twin: DigitalTwin) -> None:
+def write_pairs(runs: RunSet, folder: Path, twin: DigitalTwin) -> None:
     """Write `<Class>/dataset_i.mat` and `hidden_dataset_i.mat` for every run into a new folder.
 
     MATLAB's timeseries objects cannot be written; their place is taken by structures with the
@@ -346,14 +343,14 @@ def write_pairs(runs: xr.Dataset, folder: Path, twin: DigitalTwin) -> None:
             (place / f"hidden_dataset_{number}.mat").write_bytes(hidden)
 
 
-def _labels(runs: xr.Dataset) -> list[str]:
+def _labels(runs: RunSet) -> list[str]:
     truth = truth_of(runs)
     if truth is None:
         return [UNLABELLED] * runs.sizes["run"]
     return [label_text(fault) for fault in truth]
 
 
-def _both_paths(runs: xr.Dataset, run: int, twin: DigitalTwin) -> FloatArray:
+def _both_paths(runs: RunSet, run: int, twin: DigitalTwin) -> FloatArray:
     """Return desired and measured path, (time, 6) [m]; missing samples drawn out by lines."""
     time = as_floats(runs["time"].values)
     desired = twin.path(as_floats(runs["command"].values[run]))
@@ -367,7 +364,7 @@ def _drawn_out(time: FloatArray, values: FloatArray) -> FloatArray:
     return np.stack([np.interp(time, time[seen], v[seen]) for v in values.T], axis=1)
 
 
-def _hidden_cells(runs: xr.Dataset, run: int) -> Any:
+def _hidden_cells(runs: RunSet, run: int) -> Any:
     time = as_floats(runs["time"].values)
     command = as_floats(runs["command"].values[run])
     response = command * np.nan
@@ -395,7 +392,7 @@ def _matlab_bytes(content: dict[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def write_csv(runs: xr.Dataset, path: Path) -> None:
+def write_csv(runs: RunSet, path: Path) -> None:
     """Write a row for each sample: run, time [s], commands [rad], tool position [m]."""
     import pandas as pd
 

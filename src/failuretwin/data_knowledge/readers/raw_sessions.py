@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.core.runs import STEP_S, RunTable, Truth, concatenate
+from failuretwin.core.runs import STEP_S, RunSet, RunTable, Truth, concatenate
 from failuretwin.core.types import MS_PER_S, FloatArray
 from failuretwin.data_knowledge.readers.table import Table
 from failuretwin.data_knowledge.readers.timed_log import (
@@ -26,9 +26,6 @@ from failuretwin.data_knowledge.readers.timed_log import (
     uniform_grid,
 )
 from failuretwin.digital_model.robot import Robot
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 COMMAND_FILE = "trajectory_monitoring_cmd.csv"
 DURATION_FILE = "trajectory_monitoring_cmd_duration.csv"
@@ -210,7 +207,7 @@ def label_of(session: RawSession) -> int:
 
 def session_runs(
     session: RawSession, robot: Robot, how: As, *, published_labels: bool = False
-) -> xr.Dataset:
+) -> RunSet:
     """Return the runs of a session as one run set.
 
     Args:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, cast
+from typing import TypeAlias, cast
 
 from failuretwin import __version__
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
-from failuretwin.core.runs import concatenate
+from failuretwin.core.runs import RunSet, concatenate
 from failuretwin.data_knowledge.readers.bag_file import is_bag
 from failuretwin.data_knowledge.readers.bag_messages import BagTopics
 from failuretwin.data_knowledge.readers.bags import read_bag
@@ -21,6 +21,7 @@ from failuretwin.data_knowledge.readers.column_guess import unambiguous_columns
 from failuretwin.data_knowledge.readers.column_map import ColumnMap
 from failuretwin.data_knowledge.readers.lerobot import (
     INFO_FILE,
+    find_lerobot,
     is_lerobot,
     read_lerobot,
 )
@@ -44,11 +45,7 @@ from failuretwin.data_knowledge.store import SUFFIXES, load_run_set
 from failuretwin.data_knowledge.workers import ONE_PROCESS, Workforce
 from failuretwin.digital_model.robot import Robot, load_robot
 
-if TYPE_CHECKING:
-    import xarray as xr
-
-
-RunsLike: TypeAlias = "xr.Dataset | str | Path | Sequence[str | Path]"
+RunsLike: TypeAlias = "RunSet | str | Path | Sequence[str | Path]"
 """A run set, or where one is read from."""
 VIRTUAL_TOOL = "tool path = forward kinematics of the readings"
 """Words in the source of runs whose tool was watched by no sensor but the motors' encoders."""
@@ -93,7 +90,7 @@ def read_runs(
     robot: Robot | str = "armpi_fpv",
     options: ReadOptions | None = None,
     workforce: Workforce = ONE_PROCESS,
-) -> xr.Dataset:
+) -> RunSet:
     """Read runs from anything that holds some, as one run set.
 
     Args:
@@ -123,20 +120,15 @@ def read_logs(
     options: ReadOptions,
     workforce: Workforce = ONE_PROCESS,
     on_progress: Callable[[int], None] = lambda logs: None,
-) -> xr.Dataset:
+) -> RunSet:
     """Return the runs of some logs as one run set.
 
-    Args:
-        logs: The logs, from `find_logs`.
-        robot: The robot that they are of.
-        options: How logs become runs.
-        workforce: Processes that read them, each log once; the runs do not depend on them.
-        on_progress: Called with the number of further logs that have been read.
+    `on_progress` is called with the number of further logs that have been read.
 
     Raises:
         InputError: If a log cannot be read.
     """
-    parts: list[xr.Dataset] = []
+    parts: list[RunSet] = []
     with workforce.map(partial(read_log, robot=robot, options=options), logs) as found:
         for some in found:
             parts += some
@@ -148,10 +140,10 @@ def read_logs(
     return runs
 
 
-def as_runs(runs: RunsLike, robot: Robot | str = "armpi_fpv") -> xr.Dataset:
+def as_runs(runs: RunsLike, robot: Robot | str = "armpi_fpv") -> RunSet:
     """Return a run set as it is, or read it from wherever a path points; see `read_runs`."""
     if hasattr(runs, "data_vars"):
-        return cast("xr.Dataset", runs)
+        return cast("RunSet", runs)
     return read_runs(runs, robot)
 
 
@@ -160,12 +152,14 @@ class Reader:
     """Reader of one kind of log.
 
     Attributes:
-        recognises: Whether a path that exists is a log of its kind.
-        read: Returns the run sets in such a path.
+        read: Returns the run sets in a log of its kind.
+        recognises: Whether a path that exists is one.
+        below: Returns the logs of its kind at or below a folder that is none itself.
     """
 
-    recognises: Callable[[Path], bool]
-    read: Callable[[Path, Robot, ReadOptions], list[xr.Dataset]]
+    read: Callable[[Path, Robot, ReadOptions], list[RunSet]]
+    recognises: Callable[[Path], bool] = lambda path: False
+    below: Callable[[Path], list[Path]] = lambda folder: []
 
 
 @dataclass(frozen=True)
@@ -178,7 +172,7 @@ class Log:
     """
 
     path: Path
-    read: Callable[[Path, Robot, ReadOptions], list[xr.Dataset]]
+    read: Callable[[Path, Robot, ReadOptions], list[RunSet]]
 
     @property
     def is_run_set(self) -> bool:
@@ -186,7 +180,7 @@ class Log:
         return self.read is _read_run_set
 
 
-def read_log(log: Log, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+def read_log(log: Log, robot: Robot, options: ReadOptions) -> list[RunSet]:
     """Return the run sets in a log; raises as `read_runs` does."""
     return log.read(log.path, robot, options)
 
@@ -219,11 +213,7 @@ def _logs_in(path: Path, options: ReadOptions) -> list[Log]:
 
 
 def _logs_below(path: Path, options: ReadOptions) -> list[Log]:
-    found = [Log(folder, _read_session) for folder in find_sessions(path)]
-    found += [Log(file, _read_matlab) for file in find_matlab_files(path)]
-    infos = sorted(files_below(path, INFO_FILE.name))
-    sets = [file.parents[1] for file in infos if file.parent.name == INFO_FILE.parent.name]
-    found += [Log(folder, _read_lerobot) for folder in sets]
+    found = [Log(log, reader.read) for reader in READERS for log in reader.below(path)]
     if not found and options.columns is not None:
         found = [Log(file, _read_csv) for file in sorted(files_below(path, "*.csv"))]
     if not found:
@@ -235,33 +225,33 @@ def _logs_below(path: Path, options: ReadOptions) -> list[Log]:
     return found
 
 
-def _read_run_set(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+def _read_run_set(path: Path, robot: Robot, options: ReadOptions) -> list[RunSet]:
     return [load_run_set(path)]
 
 
-def _read_bag(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+def _read_bag(path: Path, robot: Robot, options: ReadOptions) -> list[RunSet]:
     return _log_datasets([read_bag(path, robot, options.topics)], robot, "bag")
 
 
-def _read_lerobot(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+def _read_lerobot(path: Path, robot: Robot, options: ReadOptions) -> list[RunSet]:
     found = read_lerobot(path, robot, options.lerobot)
     return _log_datasets(found.logs, robot, found.source)
 
 
-def _read_session(folder: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+def _read_session(folder: Path, robot: Robot, options: ReadOptions) -> list[RunSet]:
     session = read_session(folder, robot)
     runs = session_runs(session, robot, options.how, published_labels=options.published_labels)
     choice = {"as": options.how, "published_labels": options.published_labels}
     return [_named(runs, robot, f"raw session, as {options.how}; {VIRTUAL_TOOL}", choice)]
 
 
-def _read_matlab(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+def _read_matlab(path: Path, robot: Robot, options: ReadOptions) -> list[RunSet]:
     runs = read_matlab_file(path, robot, approximate=options.approximate).to_dataset()
     choice = {"approximate": options.approximate}
     return [_named(runs, robot, "published MATLAB file", choice)]
 
 
-def _read_csv(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+def _read_csv(path: Path, robot: Robot, options: ReadOptions) -> list[RunSet]:
     """Return the runs of a text file: by the column map, else by its header."""
     if options.columns is not None:
         return _log_datasets(options.columns.logs(path, robot), robot, "CSV with a column map")
@@ -272,16 +262,19 @@ def _read_csv(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset
 
 
 READERS = (
-    Reader(lambda path: path.suffix in SUFFIXES, _read_run_set),
-    Reader(is_bag, _read_bag),
-    Reader(is_lerobot, _read_lerobot),
-    Reader(lambda path: path.suffix == ".mat" and not path.is_dir(), _read_matlab),
-    Reader(lambda path: not path.is_dir() and (path.suffix == ".csv" or is_rtde(path)), _read_csv),
+    Reader(_read_run_set, lambda path: path.suffix in SUFFIXES),
+    Reader(_read_bag, is_bag),
+    Reader(_read_session, below=find_sessions),
+    Reader(
+        _read_matlab, lambda path: path.suffix == ".mat" and not path.is_dir(), find_matlab_files
+    ),
+    Reader(_read_lerobot, is_lerobot, find_lerobot),
+    Reader(_read_csv, lambda path: not path.is_dir() and (path.suffix == ".csv" or is_rtde(path))),
 )
 """Readers of all kinds of logs; the first one that recognises a path reads it."""
 
 
-def _log_datasets(logs: Sequence[TimedLog], robot: Robot, source: str) -> list[xr.Dataset]:
+def _log_datasets(logs: Sequence[TimedLog], robot: Robot, source: str) -> list[RunSet]:
     """Return a run set of each log, which says so where its tool path is none of a sensor."""
     return [
         _named(
@@ -294,7 +287,7 @@ def _log_datasets(logs: Sequence[TimedLog], robot: Robot, source: str) -> list[x
     ]
 
 
-def _named(runs: xr.Dataset, robot: Robot, source: str, choice: Mapping[str, object]) -> xr.Dataset:
+def _named(runs: RunSet, robot: Robot, source: str, choice: Mapping[str, object]) -> RunSet:
     """Return a run set with the attributes of its origin."""
     runs.attrs |= {
         "robot": robot.name,

@@ -52,11 +52,7 @@ def _header(path: Path) -> tuple[list[str], str]:
 
 
 def read_rtde(path: Path, robot: Robot) -> TimedLog:
-    """Read an RTDE recording.
-
-    Args:
-        path: The text file.
-        robot: The arm it is of; joints that are no motors of it are left out.
+    """Read an RTDE recording; joints that are no motors of the arm are left out.
 
     Raises:
         InputError: If it cannot be read, lacks `target_q` or all of what the arm did, the robot's

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class Table:
     cells: pd.DataFrame
 
     @classmethod
-    def read(cls, path: Path, separator: str = ",", decimal: str = ".") -> Table:
+    def read(cls, path: Path, separator: str = ",", decimal: str = ".") -> Self:
         """Read a file with a header.
 
         Raises:
@@ -104,11 +104,7 @@ class Table:
         return part.to_numpy(dtype=np.float64)
 
     def numbers(self, columns: Sequence[str], *, gaps: bool = True) -> FloatArray:
-        """Return columns as numbers, (row, column); empty cells are NaN.
-
-        Args:
-            columns: Names of the columns.
-            gaps: Whether cells may be empty.
+        """Return columns as numbers, (row, column); NaN for empty cells, which only `gaps` allows.
 
         Raises:
             InputError: If a column is missing or a cell is no number.

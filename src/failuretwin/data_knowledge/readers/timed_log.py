@@ -15,7 +15,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.movements import ROUNDING_RAD, Movements
 from failuretwin.core.polyline import simplify_motors
 from failuretwin.core.runs import AXES, REQUIRED, STEP_S, VARIABLES, RunTable
-from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -43,6 +43,10 @@ class Samples:
     def rate_hz(self) -> float:
         """Typical rate of the samples [Hz]."""
         return float(1.0 / np.median(np.diff(self.time)))
+
+    def take(self, rows: BoolArray | IntArray) -> Samples:
+        """Return some of the samples."""
+        return Samples(self.time[rows], self.value[rows])
 
 
 @dataclass(frozen=True)
@@ -149,7 +153,7 @@ def _distinct(log: TimedLog) -> TimedLog:
     def last(samples: Samples) -> Samples:
         _check_times(samples.time, log.name)
         kept = np.diff(samples.time, append=np.inf) > 0
-        return Samples(samples.time[kept], samples.value[kept])
+        return samples.take(kept)
 
     _check_times(log.command.time, log.name)
     return replace(
@@ -220,11 +224,7 @@ def _check_times(time: FloatArray, name: str) -> None:
 def uniform_grid(stamps: FloatArray, length: float, step: float, where: str) -> FloatArray:
     """Return the time grid of a run, (time,) [s].
 
-    Args:
-        stamps: Times of its commands and readings, in any order [s].
-        length: Its end [s].
-        step: Step of the grid [s].
-        where: Its name, for the error text.
+    `stamps` are the times of its commands and readings, in any order [s].
 
     Raises:
         InputError: If the stamps hold a silence that no log can mean, or the grid has far more

@@ -13,8 +13,8 @@ from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from failuretwin.connection.life_history import read_rows
 from failuretwin.connection.links.base import Commander
+from failuretwin.connection.tracked_diagnosis import read_rows
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.hypothesis import Diagnosis, Fault
 from failuretwin.core.types import FloatArray
