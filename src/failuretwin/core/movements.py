@@ -118,6 +118,8 @@ class Stretches(Movements):
         speed: Of the reference at the reading, (run, movement, motor) [rad/s]; 0 at rest.
         bend: Half its acceleration there times the square of a usual lag, (run, movement, motor)
             [rad].
+        direction: Of the friction there, from -1 to 1, (run, movement, motor); NaN: as it last
+            travelled.
         done: Share of the movement that each motor had made, (run, movement, motor).
         at_rest: Whether the reading is at rest, (run, movement).
         whole: Whether a stretch is all that is seen of its movement, (run, movement).
@@ -128,6 +130,7 @@ class Stretches(Movements):
     beginning: Annotated[FloatArray, Axes("run", "movement", "motor", empty=np.nan)]
     speed: Annotated[FloatArray, Axes("run", "movement", "motor")]
     bend: Annotated[FloatArray, Axes("run", "movement", "motor")]
+    direction: Annotated[FloatArray, Axes("run", "movement", "motor", empty=np.nan)]
     done: Annotated[FloatArray, Axes("run", "movement", "motor", empty=1.0)]
     at_rest: Annotated[BoolArray, Axes("run", "movement", empty=True)]
     whole: Annotated[BoolArray, Axes("run", "movement", empty=True)]

@@ -199,13 +199,20 @@ def test_clocks_that_are_apart_are_found(late_s):
     assert found == pytest.approx(late_s, abs=0.016)
 
 
-def test_friction_acts_against_the_motion_of_the_moment():
-    """Not against the travel since the moment before: a curve turns between."""
-    healthy, seen = moments(exact_run(curve(), 0.0))
+def test_friction_turns_over_within_twice_itself():
+    """Not with the travel since the moment before: a curve turns between."""
+    command = curve()
+    healthy, seen = moments(exact_run(command, 0.0))
     found = moments_of(healthy.without_doubt, seen)
-    speed = found.speed[0, :, 0]
-    np.testing.assert_array_equal(found.direction[0, :, 0], np.sign(speed))
-    assert (np.sign(speed) != np.sign(found.target[0] - found.origin[0])).any()
+    friction, time = np.array(healthy.settling.friction), STEP_S * np.arange(len(command))
+    for m, at in enumerate(found.time[0] - healthy.lag_s):
+        for motor, way in enumerate(command[time <= at + 1e-9].T):
+            turned = np.flatnonzero(np.diff(np.sign(np.diff(way))))
+            since = way[-1] - way[turned[-1] + 1] if len(turned) else way[-1] - way[0]
+            expected = np.clip(abs(since) / friction[motor] - 1.0, -1.0, 1.0) * np.sign(since)
+            assert found.direction[0, m, 0, motor] == pytest.approx(expected, abs=0.05)
+    turning = np.sign(found.target[0] - found.origin[0]) != np.sign(found.direction[0, :, 0])
+    assert turning.any()
 
 
 @pytest.fixture(scope="module")

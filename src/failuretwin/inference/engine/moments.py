@@ -43,7 +43,7 @@ class Moments:
         ramp: Duration of its ramps, (run, moment, motor) [s].
         time: When the moment is, (run, moment) [s].
         base: Angles that the motors go for under each outcome, (run, moment, outcome, motor) [rad].
-        direction: Sign of their last travel, or of their speed on the way, same axes.
+        direction: Sign of their last travel; on the way, of their friction, same axes.
         lost: Motors that miss their command, same axes.
         log_weight: Log probability of each outcome, (run, moment, outcome).
         outcome: Index of each among all outcomes of the movement, (run, moment, outcome).
@@ -104,6 +104,7 @@ def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
     speed, bend = (
         np.where(lost, 0.0, values[:, :, None]) for values in (movements.speed, movements.bend)
     )
+    turned = movements.direction[:, :, None]
     found = Moments(
         point=evidence.point,
         usable=evidence.usable,
@@ -113,7 +114,7 @@ def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
         ramp=np.nan_to_num(movements.ramp_duration),
         time=np.nan_to_num(0.5 * (evidence.begin + evidence.end)),
         base=base + BEND * bend,
-        direction=np.where(speed != 0.0, np.sign(speed), direction),
+        direction=np.where(lost | np.isnan(turned), direction, turned),
         lost=lost,
         log_weight=weight,
         outcome=chosen,

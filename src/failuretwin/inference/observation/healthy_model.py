@@ -272,12 +272,17 @@ class HealthyModel:
     @property
     def start_jitter_s(self) -> float:
         """Deviation of when a motor starts about its own lag [s]."""
-        return PUNCTUAL_SPREAD_S if self.knows_timing else UNKNOWN_JITTER_S
+        return PUNCTUAL_SPREAD_S if self._timing_measured else UNKNOWN_JITTER_S
 
     @property
     def lag_deviations_s(self) -> tuple[float, float]:
         """Deviations of the lag of all motors together, with the clock, and of each [s]."""
-        return KNOWN_LAG_S if self.knows_timing else LAG_S
+        return KNOWN_LAG_S if self._timing_measured else LAG_S
+
+    @property
+    def _timing_measured(self) -> bool:
+        """Whether that is known of this very robot; figures of a class are ranges of many."""
+        return self.knows_timing and self.is_calibrated
 
     def scatter_at(self, stretches: Stretches) -> FloatArray:
         """Return the scale of each motor's scatter on the way, its lag unknown, (..., motor) [rad].

@@ -43,6 +43,8 @@ CORNER_S = 0.06
 BEND_S = 0.05
 """Time constant with which motors follow, at most [s], assumed: where a command accelerates by a,
 they are off the same command a lag before by a share of half its square times a."""
+LEAST_FRICTION_RAD = 1e-4
+"""Friction that counts as none [rad]."""
 CURVED_RAD = 0.01
 """A movement whose command strays further from straight ramps is a curve [rad]."""
 
@@ -59,6 +61,7 @@ class _Moment:
     ramp: FloatArray
     speed: FloatArray
     bend: FloatArray
+    direction: FloatArray
     done: FloatArray
     whole: bool
     curved: bool
@@ -175,12 +178,32 @@ class _Looks:
             np.minimum(ramp, lasted),
             (ends[1] - ends[0]) / (2.0 * CORNER_S),
             0.5 * (BEND_S / CORNER_S) ** 2 * (ends[0] - 2.0 * pose[-1] + ends[1]),
+            self._friction(run, np.minimum(time[at] - lag, end)),
             np.clip((time[at] - lag - start) / (1.0 - early) / ramp, 0.0, 1.0)
             if not curved
             else np.ones_like(ramp),
             not curved,
             curved,
         )
+
+    def _friction(self, run: int, when: float) -> FloatArray:
+        """Return the direction of the friction of each motor at a time, from -1 to 1, (motor,).
+
+        A motor that turns back yields by its friction f to one side, then to the other:
+        d <- clip(d + dq / f, -1, 1) along the command q, a play of width 2 f.
+        """
+        time, command = self._told(run)
+        steps = np.diff(command[time <= when], axis=0)
+        width = np.maximum(np.asarray(self.model.settling.friction), LEAST_FRICTION_RAD)
+        found = np.zeros(command.shape[1])
+        for step in steps[np.abs(steps).max(axis=1) > 0.0] / width:
+            found = np.clip(found + step, -1.0, 1.0)
+        return found
+
+    def _told(self, run: int) -> tuple[FloatArray, FloatArray]:
+        """Return the time grid (time,) [s] and the command of a run, (time, motor) [rad]."""
+        runs = self.evidence.runs
+        return as_floats(runs["time"].values), as_floats(runs["command"].values[run])
 
     def _near(self, run: int, at: int) -> IntArray:
         """Return the readings about one, as many before as after: what a fault adds cancels."""
@@ -192,8 +215,7 @@ class _Looks:
 
     def _command(self, run: int, when: FloatArray) -> FloatArray:
         """Return the command at some times, (time, motor) [rad]."""
-        time = as_floats(self.evidence.runs["time"].values)
-        command = as_floats(self.evidence.runs["command"].values[run])
+        time, command = self._told(run)
         return np.stack([np.interp(when, time, one) for one in command.T], axis=-1)
 
     def _is_curved(self, run: int, m: int) -> bool:
@@ -247,6 +269,7 @@ def _put(made: SettledEvidence, stretches: Stretches, at: tuple[int, int], momen
     stretches.speed[at], stretches.at_rest[at] = moment.speed, False
     stretches.whole[at], stretches.curved[at] = moment.whole, moment.curved
     stretches.bend[at], stretches.done[at] = moment.bend, moment.done
+    stretches.direction[at] = moment.direction
 
 
 def beside(moving: TransientSamples, moments: SettledEvidence) -> TransientSamples:

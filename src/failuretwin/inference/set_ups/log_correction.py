@@ -146,6 +146,7 @@ class LogCorrection:
                 beginning=self.command(movements.beginning),
                 speed=movements.speed @ self.C.T,
                 bend=movements.bend @ self.C.T,
+                direction=movements.direction @ np.sign(self.C).T,
                 done=movements.done @ order.T,
             )
         return replace(evidence, movements=movements, point=self.point(evidence.point))
