@@ -72,6 +72,19 @@ def test_a_diagnosis_is_stored_as_it_is(store, place, armpi):
     assert place.sql("SELECT kind FROM sensors") == [("tool",)]
 
 
+def test_a_relative_path_is_that_of_the_folder_at_the_time(tmp_path, monkeypatch):
+    """Of a process that works in one folder, then in another."""
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        store = ft.open_store("robots.db", create=True)
+        store.remember([diagnosis("run", "healthy")], f"arm_{name}", log=a_log(0))
+        monkeypatch.chdir(tmp_path)
+        assert len(store.history(f"arm_{name}").recent) == 1
+        assert store.name == "robots.db"
+    assert (tmp_path / "two" / "robots.db").is_file()
+
+
 def test_nothing_is_stored_of_nothing(store, place):
     assert store.remember([], "arm_7").added == 0
     assert place.sql("SELECT * FROM robots") == []

@@ -84,8 +84,8 @@ class Database:
     """Transactions on the database of a store; no connection is held between them.
 
     Attributes:
-        file: The SQLite file; None: a server.
-        name: Path, or URL without the password, for texts.
+        file: The SQLite file, absolute; None: a server.
+        name: Path as given, or URL without the password, for texts.
     """
 
     def __init__(self, url: str | Path) -> None:
@@ -93,8 +93,11 @@ class Database:
         sqlite = parsed.get_backend_name() == "sqlite"
         if not parsed.database or parsed.database == ":memory:":
             raise InputError(f"the store's URL names no database. {EXPECTED}")
-        self.file = Path(parsed.database) if sqlite else None
-        self.name = str(self.file or _shown(parsed))
+        path = Path(parsed.database)
+        self.name = str(path) if sqlite else _shown(parsed)
+        self.file = path.absolute() if sqlite else None
+        if self.file is not None:  # engines are kept, whatever folder a process goes to
+            parsed = parsed.set(database=str(self.file))
         with needs_extra("stores on PostgreSQL need psycopg", "store"):
             self._engine = _engine(parsed, PATIENCE_S)
         self._one_state = {} if sqlite else {"isolation_level": "REPEATABLE READ"}
