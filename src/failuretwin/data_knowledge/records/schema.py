@@ -137,8 +137,8 @@ sessions = sa.Table(
 )
 """What a command did with a robot: version of the package, method, calibration it rests on.
 
-`diagnosed` counts by state all diagnoses of the robot, this session's included, without those
-behind notes: a history need not count them."""
+`diagnosed` counts by state all diagnoses of the robot up to this row, without those behind
+notes: a history need not count them."""
 
 logs = sa.Table(
     "logs",

@@ -72,7 +72,9 @@ class _Way:
         model, seen = self.model, self._looked_at(run)
         time = as_floats(self.evidence.runs["time"].values)[seen]
         when = time[:, None] - model.lag_s - shifts
-        told, before, after = (self._command(run, when + h) for h in (0.0, -CORNER_S, CORNER_S))
+        told, before, after = (
+            command_at(self.evidence, run, when + h) for h in (0.0, -CORNER_S, CORNER_S)
+        )
         speed = (after - before) / (2.0 * CORNER_S)
         pose = model.settle(told, np.sign(speed), model.none_held)
         expected, jacobian = model.sensors.expected(pose)
@@ -96,8 +98,8 @@ class _Way:
         count = min(len(seen), READINGS)
         return seen[np.unique(np.linspace(0, len(seen) - 1, count).astype(np.int64))]
 
-    def _command(self, run: int, when: FloatArray) -> FloatArray:
-        """Return the command at some times (...), as (..., motor) [rad]."""
-        time = as_floats(self.evidence.runs["time"].values)
-        command = as_floats(self.evidence.runs["command"].values[run])
-        return np.stack([np.interp(when, time, one) for one in command.T], axis=-1)
+
+def command_at(evidence: Evidence, run: int, when: FloatArray) -> FloatArray:
+    """Return the command of a run at some times (...) [s], as (..., motor) [rad]."""
+    time, command = (as_floats(evidence.runs[name].values) for name in ("time", "command"))
+    return np.stack([np.interp(when, time, one) for one in command[run].T], axis=-1)

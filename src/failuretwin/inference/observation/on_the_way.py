@@ -23,7 +23,7 @@ from failuretwin.core.movements import Stretches
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.observation.lag_offset import lag_offset
+from failuretwin.inference.observation.lag_offset import command_at, lag_offset
 
 SHARE = 0.85
 """Share of a stretch's time at which it is read: late, so that what a motor was told shows, and
@@ -159,7 +159,7 @@ class _Looks:
         def told(when: FloatArray) -> FloatArray:
             """Return what the motors have been told that is to be seen, (time, motor) [rad]."""
             since = (when - lag - start) / (1.0 - early)
-            return self._command(run, np.minimum(start + since, max(end, start)))
+            return command_at(self.evidence, run, np.minimum(start + since, max(end, start)))
 
         near = self._near(run, at)
         point = self.evidence.readings.point[run]
@@ -173,7 +173,7 @@ class _Looks:
             begin,
             time[at],
             path[-1] + off,
-            self._command(run, np.array([begin]))[0],
+            command_at(self.evidence, run, np.array([begin]))[0],
             pose[-1],
             np.minimum(ramp, lasted),
             (ends[1] - ends[0]) / (2.0 * CORNER_S),
@@ -213,11 +213,6 @@ class _Looks:
         count = min(place, len(near) - 1 - place)
         return near[place - count : place + count + 1]
 
-    def _command(self, run: int, when: FloatArray) -> FloatArray:
-        """Return the command at some times, (time, motor) [rad]."""
-        time, command = self._told(run)
-        return np.stack([np.interp(when, time, one) for one in command.T], axis=-1)
-
     def _is_curved(self, run: int, m: int) -> bool:
         """Return whether the command of a movement strays from straight ramps."""
         settled = self.evidence.settled
@@ -225,7 +220,9 @@ class _Looks:
         start, end = settled.movements.start[run, m], settled.end[run, m]
         when = time[(time >= start) & (time <= end)]
         straight = settled.movements[run : run + 1].reference(when)[0]
-        return bool(np.abs(self._command(run, when) - straight).max(initial=0.0) > CURVED_RAD)
+        return bool(
+            np.abs(command_at(self.evidence, run, when) - straight).max(initial=0.0) > CURVED_RAD
+        )
 
 
 def _joined(
