@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.kinematics import CHUNK, SerialChain, rotation_to_z
+from failuretwin.digital_model.kinematics import SerialChain, rotation_to_z
 from failuretwin.digital_model.robot import bundled_folder
 from failuretwin.digital_model.urdf.file import read_urdf
 
@@ -171,10 +171,10 @@ def test_shape_in_front_of_the_joints_is_kept(armpi, lead):
 
 
 def test_many_poses_give_what_each_gives_alone(armpi):
-    poses = np.random.default_rng(6).uniform(-2, 2, (CHUNK + 3, 4))
+    poses = np.random.default_rng(6).uniform(-2, 2, (8003, 4))
     position, jacobian = armpi.chain.position_and_jacobian(poses)
 
-    for row in (0, CHUNK - 1, CHUNK, CHUNK + 2):
+    for row in (0, 4000, 8002):
         alone = armpi.chain.position_and_jacobian(poses[row])
         np.testing.assert_allclose(position[row], alone[0], atol=1e-15)
         np.testing.assert_allclose(jacobian[row], alone[1], atol=1e-15)

@@ -1,93 +1,150 @@
 """Serial chains in batches: tool position, Jacobian, joint frames, gravity torques and reach.
 
 Every joint turns about (or slides along) the z axis of its own frame; between two such frames lies
-a constant transform. Position and Jacobian are carried from the tip to the base as three
-coordinates; entries of the constants that are 0 or 1 cost nothing.
+a constant transform. Frames are carried from the base to the tool, one pose after the other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from failuretwin.core.compiled import compiled
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import FloatArray, as_floats
-
-# Vectors of three coordinates, each a number or an array over poses.
-
-Scalar = float | FloatArray
-"""A coordinate: common to all poses (float) or one per pose (array)."""
-Vector = tuple[Scalar, Scalar, Scalar]
-Scalars = FloatArray | Sequence[float]
-"""One number per joint, or per joint and pose."""
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
 
 GRAVITY = 9.81
 """Acceleration of free fall, along -z of the base [m/s2]."""
 
-CHUNK = 8000
-"""Poses per block: 64 kB an array, so that the working set stays in the second-level cache."""
+
+@compiled
+def _advance(R: FloatArray, p: FloatArray, T: FloatArray) -> None:
+    """Move on from a frame, with axes R and origin p in the base, by a constant transform."""
+    for i in range(3):
+        x, y, z = R[i, 0], R[i, 1], R[i, 2]
+        p[i] += x * T[0, 3] + y * T[1, 3] + z * T[2, 3]
+        for j in range(3):
+            R[i, j] = x * T[0, j] + y * T[1, j] + z * T[2, j]
 
 
-def _chunks(count: int) -> Iterator[slice]:
-    """Return slices of `CHUNK` that cover `count` poses."""
-    return (slice(start, start + CHUNK) for start in range(0, count, CHUNK))
+@compiled
+def _move(R: FloatArray, p: FloatArray, value: float, slides: bool) -> None:
+    """Turn a frame about its z axis, or slide it along."""
+    c, s = np.cos(value), np.sin(value)
+    for i in range(3):
+        if slides:
+            p[i] += value * R[i, 2]
+        else:
+            x, y = R[i, 0], R[i, 1]
+            R[i, 0], R[i, 1] = c * x + s * y, c * y - s * x
 
 
-def _scale(factor: float, value: Scalar) -> Scalar:
-    """Return `factor` times `value`."""
-    if factor == 0.0 or (isinstance(value, float) and value == 0.0):
-        return 0.0
-    if factor == 1.0:
-        return value
-    return -value if factor == -1.0 else factor * value
+@compiled
+def _start(R: FloatArray, p: FloatArray) -> None:
+    """Go to the base."""
+    for i in range(3):
+        p[i] = 0.0
+        for j in range(3):
+            R[i, j] = 1.0 if i == j else 0.0
 
 
-def _add(a: Scalar, b: Scalar) -> Scalar:
-    """Return `a` plus `b`."""
-    if isinstance(a, float) and a == 0.0:
-        return b
-    if isinstance(b, float) and b == 0.0:
-        return a
-    return a + b
+@compiled
+def _write_frames(
+    q: FloatArray, transforms: FloatArray, slides: BoolArray, found: FloatArray
+) -> None:
+    """Write x, y, z axis and origin of joints and tool, (joint + 1, 4, coordinate, pose)."""
+    R, p, joints = np.empty((3, 3)), np.empty(3), q.shape[1]
+    for n in range(len(q)):
+        _start(R, p)
+        for j in range(joints + 1):
+            _advance(R, p, transforms[j])
+            for i in range(3):
+                found[j, 3, i, n] = p[i]
+                for k in range(3):
+                    found[j, k, i, n] = R[i, k]
+            if j < joints:
+                _move(R, p, q[n, j], slides[j])
 
 
-def _times(factor: Scalar, vector: FloatArray) -> Vector:
-    x, y, z = (factor * value if value else 0.0 for value in vector.tolist())
-    return x, y, z
+@compiled
+def _write_positions(
+    q: FloatArray,
+    transforms: FloatArray,
+    slides: BoolArray,
+    point: FloatArray,
+    jacobian: FloatArray,
+) -> None:
+    """Write tool positions (pose, 3) and, where there is room, Jacobians (pose, 3, joint)."""
+    R, p, joints = np.empty((3, 3)), np.empty(3), q.shape[1]
+    axis, origin = np.empty((joints, 3)), np.empty((joints, 3))
+    for n in range(len(q)):
+        _start(R, p)
+        for j in range(joints):
+            _advance(R, p, transforms[j])
+            for i in range(3):
+                axis[j, i], origin[j, i] = R[i, 2], p[i]
+            _move(R, p, q[n, j], slides[j])
+        _advance(R, p, transforms[joints])
+        for i in range(3):
+            point[n, i] = p[i]
+        if len(jacobian):
+            for j in range(joints):
+                for i in range(3):
+                    k, m = (i + 1) % 3, (i + 2) % 3
+                    far, near = p[m] - origin[j, m], p[k] - origin[j, k]
+                    turned = axis[j, k] * far - axis[j, m] * near
+                    jacobian[n, i, j] = axis[j, i] if slides[j] else turned
 
 
-def _plus(a: Vector, b: Vector) -> Vector:
-    return _add(a[0], b[0]), _add(a[1], b[1]), _add(a[2], b[2])
+@compiled
+def _write_torques(
+    q: FloatArray,
+    transforms: FloatArray,
+    slides: BoolArray,
+    mass: FloatArray,
+    centre: FloatArray,
+    payload: FloatArray,
+    torque: FloatArray,
+) -> None:
+    """Write the torque of gravity on every joint, (pose, joint): a . (sum of m (x - o)) x g.
 
-
-def _turn(T: FloatArray, v: Vector) -> Vector:
-    """Return the direction `v` turned by the constant transform `T`."""
-    rows = T[:3, :3].tolist()
-    x, y, z = (_add(_add(_scale(r[0], v[0]), _scale(r[1], v[1])), _scale(r[2], v[2])) for r in rows)
-    return x, y, z
-
-
-def _move(T: FloatArray, v: Vector) -> Vector:
-    """Return the point `v` moved by the constant transform `T`."""
-    x, y, z = T[:3, 3].tolist()
-    return _plus(_turn(T, v), (x, y, z))
-
-
-def _spin(c: Scalar, s: Scalar, v: Vector) -> Vector:
-    """Return `v` turned about z by the angles with cosine `c` and sine `s`."""
-    x, y, z = v
-    x_zero = isinstance(x, float) and x == 0.0
-    y_zero = isinstance(y, float) and y == 0.0
-    if x_zero and y_zero:
-        return v
-    if x_zero:
-        return -(s * y), c * y, z
-    if y_zero:
-        return c * x, s * x, z
-    return c * x - s * y, s * x + c * y, z
+    Args:
+        q: Joint values, (pose, joint).
+        transforms: Between joints, (joint + 1, 4, 4).
+        slides: (joint,).
+        mass: Behind each joint, (joint,) [kg].
+        centre: Its centre in the frame that moves with the joint, (joint, 3) [m].
+        payload: Mass at the tool point, (pose,) [kg].
+        torque: Written.
+    """
+    R, p, joints = np.empty((3, 3)), np.empty(3), q.shape[1]
+    axis, origin, middle = np.empty((3, joints, 3))
+    for n in range(len(q)):
+        _start(R, p)
+        for j in range(joints):
+            _advance(R, p, transforms[j])
+            for i in range(3):
+                axis[j, i], origin[j, i] = R[i, 2], p[i]
+            _move(R, p, q[n, j], slides[j])
+            for i in range(3):
+                middle[j, i] = p[i]
+                for k in range(3):
+                    middle[j, i] += R[i, k] * centre[j, k]
+        _advance(R, p, transforms[joints])
+        carried = payload[n]
+        x, y = carried * p[0], carried * p[1]
+        for j in range(joints - 1, -1, -1):
+            carried += mass[j]
+            x += mass[j] * middle[j, 0]
+            y += mass[j] * middle[j, 1]
+            if slides[j]:
+                torque[n, j] = -GRAVITY * carried * axis[j, 2]
+            else:
+                across = (x - carried * origin[j, 0]) * axis[j, 1]
+                torque[n, j] = GRAVITY * (across - (y - carried * origin[j, 1]) * axis[j, 0])
 
 
 @dataclass(frozen=True)
@@ -132,32 +189,28 @@ class SerialChain:
         if not self.joints:
             raise InputError("a chain needs one moving joint at least; this one has none.")
 
+    @cached_property
+    def constants(self) -> tuple[FloatArray, BoolArray]:
+        """Transforms between frames of joints, (joint + 1, 4, 4), and which joints slide."""
+        transforms = np.stack([*(joint.T_pj for joint in self.joints), self.T_jt])
+        return as_floats(transforms), np.array([joint.prismatic for joint in self.joints])
+
     def position(self, q: FloatArray) -> FloatArray:
         """Return tool positions (..., 3) [m], base frame, for `q` (..., joint) [rad or m]."""
         flat = self._flatten(q)
-        out = np.empty((len(flat), 3))
-        for rows in _chunks(len(flat)):
-            point, _ = self._carry(flat[rows].T.copy(), derivatives=False)
-            for axis in range(3):
-                out[rows, axis] = point[axis]
-        return out.reshape(*np.shape(q)[:-1], 3)
+        point = np.empty((len(flat), 3))
+        _write_positions(flat, *self.constants, point, np.empty((0, 3, 0)))
+        return point.reshape(*np.shape(q)[:-1], 3)
 
     def position_and_jacobian(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return tool positions (..., 3) [m] and Jacobians (..., 3, joint) [m/rad or m/m].
 
         Both are in the base frame; `q` are joint values in chain order, (..., joint) [rad or m].
         """
-        flat = self._flatten(q)
-        point_out = np.empty((len(flat), 3))
-        jacobian = np.empty((len(flat), 3, len(self.joints)))
-        for rows in _chunks(len(flat)):
-            point, columns = self._carry(flat[rows].T.copy(), derivatives=True)
-            for axis in range(3):
-                point_out[rows, axis] = point[axis]
-                for j, column in enumerate(columns):
-                    jacobian[rows, axis, j] = column[axis]
-        lead = np.shape(q)[:-1]
-        return point_out.reshape(*lead, 3), jacobian.reshape(*lead, 3, len(self.joints))
+        flat, lead = self._flatten(q), np.shape(q)[:-1]
+        point, jacobian = np.empty((len(flat), 3)), np.empty((len(flat), 3, len(self.joints)))
+        _write_positions(flat, *self.constants, point, jacobian)
+        return point.reshape(*lead, 3), jacobian.reshape(*lead, 3, len(self.joints))
 
     def frames(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the frames of all joints, before each moves, and of the tool, in the base frame.
@@ -173,22 +226,9 @@ class SerialChain:
 
     def frames_by_joint(self, q: FloatArray) -> FloatArray:
         """Return x, y, z axis and origin of joints and tool, (joint + 1, 4, coordinate, pose)."""
-        values = self._flatten(q).T
-        count = values.shape[1]
-        cosine, sine = np.cos(values), np.sin(values)
-        found = np.empty((len(self.joints) + 1, 4, 3, count))
-        here = np.zeros((4, 3, count))
-        here[[0, 1, 2], [0, 1, 2]] = 1.0
-        for j, T in enumerate([*(joint.T_pj for joint in self.joints), self.T_jt]):
-            np.matmul(T.T, here.reshape(4, -1), out=found[j].reshape(4, -1))
-            if j == len(self.joints):
-                break
-            here = found[j].copy()
-            if self.joints[j].prismatic:
-                here[3] += values[j] * here[2]
-            else:
-                x, y = found[j, :2]
-                here[0], here[1] = cosine[j] * x + sine[j] * y, cosine[j] * y - sine[j] * x
+        flat = self._flatten(q)
+        found = np.empty((len(self.joints) + 1, 4, 3, len(flat)))
+        _write_frames(flat, *self.constants, found)
         return found
 
     def rotation_and_derivative(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -211,29 +251,7 @@ class SerialChain:
                 f"joint values have shape {q.shape}; the last axis must hold the "
                 f"{len(self.joints)} joints {', '.join(joint.name for joint in self.joints)}."
             )
-        return q.reshape(-1, len(self.joints))
-
-    def _carry(self, q: FloatArray, *, derivatives: bool) -> tuple[Vector, list[Vector]]:
-        """Carry the tool point from tip to base for `q` (joint, pose).
-
-        Each derivative starts at its joint as a simple vector; the joints below turn it like any
-        direction.
-        """
-        point: Vector = tuple(float(x) for x in self.T_jt[:3, 3])  # type: ignore[assignment]
-        columns: list[Vector] = []
-        for joint, value in zip(reversed(self.joints), q[::-1], strict=True):
-            tangent: Vector = (0.0, 0.0, 1.0)
-            if joint.prismatic:
-                point = (point[0], point[1], _add(point[2], value))
-            else:
-                c, s = np.cos(value), np.sin(value)
-                point = _spin(c, s, point)
-                columns = [_spin(c, s, column) for column in columns]
-                tangent = (_scale(-1.0, point[1]), point[0], 0.0)
-            if derivatives:
-                columns = [_turn(joint.T_pj, column) for column in (tangent, *columns)]
-            point = _move(joint.T_pj, point)
-        return point, columns
+        return np.ascontiguousarray(q.reshape(-1, len(self.joints)))
 
 
 def cross(a: FloatArray, b: FloatArray, axis: int = -1) -> FloatArray:
@@ -277,53 +295,11 @@ class Loads:
             payload: Mass at the tool point, () or the leading axes of `q` [kg].
         """
         q = as_floats(q)
-        flat = q.reshape(-1, q.shape[-1])
-        carried = np.broadcast_to(payload, q.shape[:-1]).reshape(-1) if np.any(payload) else None
-        if len(flat) == 1:  # plain numbers: ten times as fast as arrays of one
-            extra = 0.0 if carried is None else float(carried[0])
-            value, cosine, sine = (x[0].tolist() for x in (flat, np.cos(flat), np.sin(flat)))
-            return as_floats(self._carry(value, cosine, sine, extra)).reshape(q.shape)
-        out = np.empty_like(flat)
-        for rows in _chunks(len(flat)):
-            own = flat[rows].T.copy()
-            mass = 0.0 if carried is None else carried[rows]
-            for joint, value in enumerate(self._carry(own, np.cos(own), np.sin(own), mass)):
-                out[rows, joint] = value
+        flat = np.ascontiguousarray(q.reshape(-1, q.shape[-1]))
+        carried = np.array(np.broadcast_to(payload, q.shape[:-1]), dtype=np.float64).reshape(-1)
+        out = np.empty(flat.shape)
+        _write_torques(flat, *self.chain.constants, self.mass, self.centre, carried, out)
         return out.reshape(q.shape)
-
-    def _carry(self, q: Scalars, cosine: Scalars, sine: Scalars, payload: Scalar) -> list[Scalar]:
-        """Return the torque of each joint for `q`, its cosine and sine, (joint, pose) or (joint,).
-
-        Gravity is carried from base to tip, mass times position from tip to base; the torque is
-        their cross product about the joint's axis.
-        """
-        down = self._gravity(cosine, sine)
-        mass = payload
-        moment = _times(payload, self.chain.T_jt[:3, 3])
-        torque: list[Scalar] = []
-        for j in reversed(range(len(q))):
-            joint = self.chain.joints[j]
-            mass = _add(mass, float(self.mass[j]))
-            moment = _plus(moment, _times(float(self.mass[j]), self.centre[j]))
-            if joint.prismatic:
-                torque.append(mass * down[j][2])
-                moment = (moment[0], moment[1], _add(moment[2], mass * q[j]))
-            else:
-                moment = _spin(cosine[j], sine[j], moment)
-                torque.append(_add(moment[0] * down[j][1], -(moment[1] * down[j][0])))
-            moment = _plus(_turn(joint.T_pj, moment), _times(mass, joint.T_pj[:3, 3]))
-        return torque[::-1]
-
-    def _gravity(self, cosine: Scalars, sine: Scalars) -> list[Vector]:
-        """Return gravity in the frame of each joint before it turns [m/s2]."""
-        here: Vector = (0.0, 0.0, -GRAVITY)
-        seen = []
-        for joint, c, s in zip(self.chain.joints, cosine, sine, strict=True):
-            here = _turn(joint.T_pj.T, here)
-            seen.append(here)
-            if not joint.prismatic:
-                here = _spin(c, -s, here)
-        return seen
 
 
 # Levers and reach, by random poses.

@@ -9,6 +9,7 @@ from scipy.special import logsumexp
 
 import failuretwin as ft
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
+from failuretwin.core.numerics import log_fall, log_norm
 from failuretwin.core.runs import truth_of
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.arm_classes import generic_imperfections
@@ -17,7 +18,6 @@ from failuretwin.digital_model.geometry import Geometry, JointCorrection
 from failuretwin.digital_model.nonidealities import Readings
 from failuretwin.digital_model.robot import _assembled, load_robot
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.engine.filter import filter_rows, refine
 from failuretwin.inference.engine.moments import moments_of
 from failuretwin.inference.engine.picks import Part, Picks, prepared
 from failuretwin.inference.engine.posterior import marginal_likelihoods, theta_posterior
@@ -74,11 +74,10 @@ def uncalibrated(runs):
 
 def sampled_evidence(part, found, row, rng):
     """log p(run | row) by importance sampling of f, from a Student t about what was found."""
-    ready = part.filter_rows
-    mixture_at, usable, mean, noise = ready.mixture_at, ready.usable, ready.mean, ready.noise
-    channels = mean.shape[-1]
+    usable, noise = part.scene.moments.usable[part.picks.run], part.scene.noise
+    (mean, spread), channels = part.prior, part.scene.moments.point.shape[-1]
     some = np.flatnonzero(np.repeat(usable[row], channels))
-    K = ready.spread[row][np.ix_(some, some)]
+    K = spread[row][np.ix_(some, some)]
     K += 1e-9 * np.trace(K) / len(K) * np.eye(len(K))
     W = np.zeros((mean[row].size,) * 2)
     information, shifts = found.sites
@@ -101,12 +100,12 @@ def sampled_evidence(part, found, row, rng):
     whole[:, some] = f
     total = log_p - log_q
     for m in np.flatnonzero(usable[row]):
-        mixture = mixture_at(int(m))
-        residual, scale = (values[row] for values in mixture.by_row)
-        precision, determinant = np.linalg.inv(scale), np.linalg.slogdet(scale)[1]
+        residual, scale = (values[row] for values in part.outcomes_at(int(m)))
+        precision = np.linalg.inv(scale)
         error = residual - whole[:, None, m * channels : (m + 1) * channels]
         square = np.einsum("nai,aij,naj->na", error, precision, error)
-        terms = mixture.log_weight[:, row] + noise.log_density(square, determinant)
+        fall = log_fall(square, noise.dof, channels) - 0.5 * np.linalg.slogdet(scale)[1]
+        terms = part.log_weight[row, m] + log_norm(noise.dof, channels) + fall
         total += np.logaddexp(logsumexp(terms, axis=1), noise.log_outlier)
     weight = np.exp(total - total.max())
     deviation = weight.std() / weight.mean() / np.sqrt(DRAWS)
@@ -124,7 +123,7 @@ def test_evidence_of_likely_rows_is_that_of_importance_sampling(uncalibrated):
         picks = Picks(np.array([run]), np.array([row]), np.array([0]))
         components = uncalibrated.components
         part = Part(uncalibrated.scene, rows, picks, components, prepared(rows, components))
-        found = refine(part.filter_rows, filter_rows(part.filter_rows))
+        found = part.refined(part.filtered())
         exact, deviation = sampled_evidence(part, found, 0, rng)
         if deviation < 0.05:  # else sampling itself does not tell
             off.append(float(found.total[0]) - exact)

@@ -4,7 +4,6 @@
 
 Read in this order; each module states its term:
 
-    symmetric      packed symmetric matrices: an array for each entry of the lower triangle
     integral       one moment under one row: evidence, mean and covariance of f, in closed form
     filter         moment by moment, and every moment again given all others
     moments        settled positions and readings on the way -> moments

@@ -15,15 +15,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.core.numerics import log_of, log_sum
+from failuretwin.core.compiled import compiled
+from failuretwin.core.numerics import log_of
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.settling import sag
 from failuretwin.failure_behavior.fault import Arrival
 from failuretwin.failure_behavior.mode import FaultMode, Signature
-from failuretwin.inference.engine import symmetric
+from failuretwin.inference.engine.integral import Noise, invert, log_density
 from failuretwin.inference.engine.outcomes import Outcomes
 from failuretwin.inference.engine.rows import AmountPrior, Rows, Scene, before_onset, sampled
-from failuretwin.inference.engine.symmetric import packed, unpacked
 from failuretwin.inference.engine.theta import Motion, columns
 from failuretwin.inference.faults.fault_sizes import SizePrior, coarse_sizes
 from failuretwin.inference.faults.priors import OnsetIntervals, plateau_or_ramp
@@ -92,39 +92,34 @@ class _Motor:
         Returns:
             Amounts (run, row) and outcomes (run, row, moment).
         """
-        moments = self.scene.moments
+        moments, motor = self.scene.moments, self.motor
         nodes, between = _chebyshev(grid)
         nodes = np.repeat(nodes[:, None], 1 if alike else len(self.first), axis=1)
-        point = np.moveaxis(moments.point, -1, 0)[:, :, None, :, None]
         count = min(1 + len(self.variance), moments.base.shape[2])  # the likeliest
         seen = [self._expected(nodes, ARRIVED + a) for a in range(count)]
         _, jacobian, angle = seen[0]
-        precision, log_determinant = self._precision(between, jacobian, angle)
-        says = []
-        for a, (expected, _, _) in enumerate(seen):
-            error = point - np.moveaxis(expected, -1, 0) @ between.T
-            square = symmetric.dot(error, symmetric.times(precision, error))
-            weight = moments.log_weight[:, None, :, None, a]
-            says.append(weight + self.scene.noise.log_density(square, log_determinant))
-        density = np.stack(says)
-        whole = np.logaddexp(log_sum(density, axis=0), self.scene.noise.log_outlier)
-        whole = np.where(self._counts[..., None], whole, 0.0).sum(axis=2)  # (run, row, node)
+        step = np.abs(np.diff(angle @ between.T, axis=-1)).mean(axis=-1)
+        variance = np.broadcast_to(self.variance, (*step.shape, len(self.variance))).copy()
+        variance[..., motor] += step**2 / 6.0
+        says = np.empty((*step.shape, grid.shape[1]))  # (run, row, moment, node)
+        outcome = np.empty(says.shape, dtype=np.int64)
+        _write_densities(
+            moments.point,
+            np.stack([expected for expected, _, _ in seen]),
+            np.ascontiguousarray(jacobian),
+            variance,
+            self._doubt,
+            moments.log_weight,
+            between,
+            self.scene.noise,
+            says,
+            outcome,
+        )
+        whole = np.where(self._counts[..., None], says, 0.0).sum(axis=2)
         at = whole.argmax(axis=-1)[..., None]
-        outcome = density.argmax(axis=0)
         outcome = np.broadcast_to(outcome, (*self._counts.shape, outcome.shape[-1]))
         found = np.take_along_axis(np.broadcast_to(grid[:, None], whole.shape), at, axis=2)
         return found[..., 0], np.take_along_axis(outcome, at[..., None], axis=3)[..., 0]
-
-    def _precision(
-        self, between: FloatArray, jacobian: FloatArray, angle: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return inverse scale (packed) and its log determinant at each amount of a grid."""
-        jacobian = np.einsum("nk,brmkcj->brmncj", between, jacobian, optimize=True)
-        step = np.abs(np.diff(angle @ between.T, axis=-1)).mean(axis=-1, keepdims=True)
-        variance = np.broadcast_to(self.variance, jacobian[..., 0, :].shape).copy()
-        variance[..., self.motor] += step**2 / 6.0
-        scale = np.matmul(jacobian * variance[..., None, :], np.swapaxes(jacobian, -1, -2))
-        return symmetric.inverse(packed(scale + self._doubt[:, None, :, None]))
 
     def refined(
         self, found: tuple[FloatArray, IntArray], low: FloatArray, high: FloatArray
@@ -143,7 +138,7 @@ class _Motor:
             error = self.scene.moments.point[:, None] - expected[:, :, :, 0]
             jacobian = jacobian[:, :, :, 0]
             scale = np.matmul(jacobian * self.variance, np.swapaxes(jacobian, -1, -2))
-            precision = unpacked(symmetric.inverse(packed(scale + self._doubt[:, None]))[0])
+            precision = np.linalg.inv(scale + self._doubt[:, None])
             lever = jacobian[..., self.motor] * slope[..., None]
             pull = np.einsum("brmij,brmj->brmi", precision, error)
             square = np.einsum("brmi,brmi->brm", error, pull)
@@ -241,6 +236,90 @@ class _Motor:
             onsets=sampled(*onsets),
         )
         return before_onset(rows, scene.healthy, scene.columns)
+
+
+@compiled
+def _write_densities(
+    point: FloatArray,
+    expected: FloatArray,
+    jacobian: FloatArray,
+    variance: FloatArray,
+    doubt: FloatArray,
+    log_weight: FloatArray,
+    between: FloatArray,
+    noise: Noise,
+    says: FloatArray,
+    outcome: IntArray,
+) -> None:
+    """Write the log density of each moment at amounts of a grid, and its likeliest outcome.
+
+    Args:
+        point: What was seen, (run, moment, channel) [m].
+        expected: At some amounts, (outcome, run, row, moment, amount, channel) [m].
+        jacobian: Of the first outcome, (run, row, moment, amount, channel, motor).
+        variance: Of each motor, (run, row, moment, motor) [rad2].
+        doubt: Of what is seen beside it, (run, moment, channel, channel) [m2].
+        log_weight: Of outcomes, (run, moment, outcome).
+        between: Weights of the amounts at each node of the grid, (node, amount).
+        noise: The Student t of residuals.
+        says: (run, row, moment, node), written.
+        outcome: Same axes, written.
+    """
+    runs, rows, moments, nodes = says.shape
+    size = jacobian.shape[-2]
+    precision, error = np.empty((size, size)), np.empty(size)
+    for r, row, m in np.ndindex(runs, rows, moments):
+        for n in range(nodes):
+            _write_scale(
+                jacobian[r, row, m], variance[r, row, m], doubt[r, m], between[n], precision
+            )
+            determinant = invert(precision)
+            best, total = -np.inf, np.exp(noise.log_outlier)
+            for a in range(len(expected)):
+                for c in range(size):
+                    error[c] = point[r, m, c]
+                    for k in range(between.shape[1]):
+                        error[c] -= between[n, k] * expected[a, r, row, m, k, c]
+                density = log_density(noise, _square(precision, error), determinant)
+                density += log_weight[r, m, a]
+                total += np.exp(density)
+                if density > best or a == 0:
+                    best, outcome[r, row, m, n] = density, a
+            says[r, row, m, n] = np.log(total)
+
+
+@compiled
+def _write_scale(
+    jacobian: FloatArray,
+    variance: FloatArray,
+    doubt: FloatArray,
+    between: FloatArray,
+    scale: FloatArray,
+) -> None:
+    """Write J diag(v) J^T and the doubt, with J interpolated, (amount, channel, motor)."""
+    amounts, size, motors = jacobian.shape
+    lever = np.empty(size)
+    for c in range(size):
+        for d in range(size):
+            scale[c, d] = doubt[c, d]
+    for j in range(motors):
+        for c in range(size):
+            lever[c] = 0.0
+            for k in range(amounts):
+                lever[c] += between[k] * jacobian[k, c, j]
+        for c in range(size):
+            for d in range(size):
+                scale[c, d] += variance[j] * lever[c] * lever[d]
+
+
+@compiled
+def _square(precision: FloatArray, error: FloatArray) -> float:
+    """Return error^T precision error."""
+    total = 0.0
+    for i in range(len(error)):
+        for j in range(len(error)):
+            total += error[i] * precision[i, j] * error[j]
+    return total
 
 
 def taken(values: FloatArray, outcome: IntArray) -> FloatArray:

@@ -1,6 +1,7 @@
-"""The filter: moment by moment, each a Laplace integral in the numbers of one moment.
+"""The filter: moment by moment, each an integral in the numbers of one moment.
 
-Rows of hypotheses carry the normal distribution of f = G theta + H z over all their moments,
+A pick is a row of a hypothesis in one run by one component. It carries the normal distribution of
+f = G theta + H z over all its moments,
 
     f ~ N(G mu, K),    K = G V G^T + var(z) H H^T
 
@@ -15,103 +16,75 @@ Section: docs/inference.md#filter
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from failuretwin.core.numerics import log_of, log_sum
+from failuretwin.core.compiled import compiled
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.engine.integral import Mixture, Noise, moment_posterior
-from failuretwin.inference.engine.symmetric import packed, unpacked
+from failuretwin.inference.engine.integral import Moment, Noise, log_total, moment_integral
 
 
-@dataclass(frozen=True)
-class FilterRows:
-    """Rows with the normal distribution of f = G theta + H z over all moments.
+class Tables(NamedTuple):
+    """What rows say of outcomes and of f.
 
     Attributes:
-        mixture_at: The outcomes of a moment under each row.
-        usable: Moments with readings, (row, moment).
-        kept: Probability that the outcome of the moment before holds on, (row, moment).
-        mean: G mu, (row, moment, channel) [m].
-        covariance: G V G^T, (row, moment * channel, moment * channel) [m2].
-        lever: H, (row, moment, channel, amount).
-        variance: Of each amount, (row, amount).
-        noise: The Student t of residuals.
+        residual: r_a less what theta moves it by beside f, (normal, place, moment, outcome,
+            channel) [m].
+        scatter: J diag(s^2) J^T, (place, moment, outcome, channel, channel) [m2].
+        extra: Variance of single motors, and of theta where outcomes differ from f, (normal, place,
+            moment, outcome, channel, channel) [m2].
+        log_weight: Log probability of each outcome, (weight place, moment, outcome).
+        mean: G mu, (normal, place, moment, channel) [m].
+        covariance: G V G^T, (normal, place, moment * channel, moment * channel) [m2].
     """
 
-    mixture_at: Callable[[int], Mixture]
-    usable: BoolArray
-    kept: FloatArray
+    residual: FloatArray
+    scatter: FloatArray
+    extra: FloatArray
+    log_weight: FloatArray
     mean: FloatArray
     covariance: FloatArray
-    lever: FloatArray
-    variance: FloatArray
-    noise: Noise
-
-    @classmethod
-    def joined(cls, parts: Sequence[FilterRows]) -> FilterRows:
-        """Return several sets of rows as one."""
-        if len(parts) == 1:
-            return parts[0]
-
-        def join(name: str) -> FloatArray:
-            return np.concatenate([getattr(one, name) for one in parts])
-
-        return cls(
-            lambda m: Mixture.joined([one.mixture_at(m) for one in parts]),
-            np.concatenate([one.usable for one in parts]),
-            join("kept"),
-            join("mean"),
-            join("covariance"),
-            join("lever"),
-            join("variance"),
-            parts[0].noise,
-        )
-
-    @property
-    def prior(self) -> tuple[FloatArray, FloatArray]:
-        """Mean (row, number) and covariance (row, number, number) of f and, last, z."""
-        rows, moments, channels = self.mean.shape
-        size, amounts = moments * channels, self.variance.shape[1]
-        crossed = self._flat_lever * self.variance[:, None]
-        whole = np.zeros((rows, size + amounts, size + amounts))
-        whole[:, :size, :size] = self.spread
-        whole[:, :size, size:] = crossed
-        whole[:, size:, :size] = np.swapaxes(crossed, 1, 2)
-        whole[:, range(size, size + amounts), range(size, size + amounts)] = self.variance
-        mean = self.mean.reshape(rows, size)
-        return np.concatenate([mean, np.zeros((rows, amounts))], axis=1), whole
-
-    @property
-    def spread(self) -> FloatArray:
-        """K, (row, moment * channel, moment * channel) [m2]."""
-        flat = self._flat_lever
-        return self.covariance + (flat * self.variance[:, None]) @ np.swapaxes(flat, 1, 2)
-
-    @property
-    def _flat_lever(self) -> FloatArray:
-        rows, moments, channels, amounts = self.lever.shape
-        return self.lever.reshape(rows, moments * channels, amounts)
 
 
-@dataclass(frozen=True)
-class RowsPosterior:
-    """What all moments say of some rows.
+class Places(NamedTuple):
+    """Where picks stand in the tables, and what is true of each, (pick, ...).
 
     Attributes:
-        log_evidence: Log density of each moment given those before it, (row, moment).
-        alpha: What the integral of each moment says, (row, moment, channel).
-        curvature: B, (row, moment, channel, channel).
-        ahead: Mean of f without the moment, (row, moment, channel) [m].
-        doubt: Covariance of f without the moment, (row, moment, channel, channel) [m2].
-        share: Share of each outcome when its moment came, (row, moment, outcome).
-        log_weight: Log of its weight before that, (row, moment, outcome).
-        mean: Mean of f given all moments, (row, moment, channel) [m].
-        amount: Mean of z given all moments, (row, amount).
-        amount_spread: Its covariance, (row, amount, amount).
+        normal: Of each pick.
+        place: Of each pick.
+        weight_place: Of each pick.
+        variance: Factor on the variance of scatter, and variance of the noise [m2], (pick, 2).
+        usable: Moments with readings, (pick, moment).
+        kept: Probability that the outcome of the moment before holds on, (pick, moment).
+        lever: H, (pick, moment, channel).
+        amount: var(z), (pick,).
+    """
+
+    normal: IntArray
+    place: IntArray
+    weight_place: IntArray
+    variance: FloatArray
+    usable: BoolArray
+    kept: FloatArray
+    lever: FloatArray
+    amount: FloatArray
+
+
+class RowsPosterior(NamedTuple):
+    """What all moments say of some picks.
+
+    Attributes:
+        log_evidence: Log density of each moment given those before it, (pick, moment).
+        alpha: What the integral of each moment says, (pick, moment, channel).
+        curvature: B, (pick, moment, channel, channel).
+        ahead: Mean of f without the moment, (pick, moment, channel) [m].
+        doubt: Covariance of f without the moment, (pick, moment, channel, channel) [m2].
+        share: Share of each outcome when its moment came, (pick, moment, outcome).
+        log_weight: Log of its weight before that, (pick, moment, outcome).
+        mean: Mean of f given all moments, (pick, moment, channel) [m].
+        amount: Mean and variance of z given all moments, (pick, 2).
     """
 
     log_evidence: FloatArray
@@ -123,172 +96,63 @@ class RowsPosterior:
     log_weight: FloatArray
     mean: FloatArray
     amount: FloatArray
-    amount_spread: FloatArray
+
+    @classmethod
+    def zeros(cls, picks: int, moments: int, channels: int, outcomes: int) -> RowsPosterior:
+        """Return a posterior to be written."""
+        moment = picks, moments
+        vector, matrix = (*moment, channels), (*moment, channels, channels)
+        shapes = (moment, vector, matrix, vector, matrix, (*moment, outcomes))
+        parts = [np.zeros(shape) for shape in shapes]
+        parts += [np.full((*moment, outcomes), -np.inf), np.zeros(vector), np.zeros((picks, 2))]
+        return cls(*parts)
 
     @property
     def total(self) -> FloatArray:
-        """Log density of all moments, (row,)."""
+        """Log density of all moments, (pick,)."""
         return np.asarray(self.log_evidence.sum(axis=1))
 
-    @cached_property
+    @property
     def sites(self) -> tuple[FloatArray, FloatArray]:
-        """W and b of the normal factor that stands for each moment, as `site` returns them."""
-        return site(self.alpha, self.curvature, self.ahead, self.doubt)
+        """W (pick, moment, channel, channel) and b of the factors that stand for moments."""
+        W, b = np.zeros(self.curvature.shape), np.zeros(self.alpha.shape)
+        _write_sites(self, W, b)
+        return W, b
 
-    def __getitem__(self, rows: IntArray | slice) -> RowsPosterior:
-        """Return some of the rows."""
-        return RowsPosterior(*(getattr(self, field.name)[rows] for field in fields(self)))
+    def some(self, picks: IntArray | slice) -> RowsPosterior:
+        """Return some of the picks."""
+        return RowsPosterior(*(values[picks] for values in self))
 
-    def with_rows(self, places: IntArray, some: RowsPosterior) -> RowsPosterior:
-        """Return the same with some of the rows replaced."""
-        names = [field.name for field in fields(self)]
-        values = {name: getattr(self, name).copy() for name in names}
-        for name in names:
-            values[name][places] = getattr(some, name)
-        return RowsPosterior(**values)
+    def with_picks(self, places: IntArray, some: RowsPosterior) -> RowsPosterior:
+        """Return the same with some of the picks replaced."""
+        found = RowsPosterior(*(values.copy() for values in self))
+        for values, new in zip(found, some, strict=True):
+            values[places] = new
+        return found
 
     @classmethod
     def joined(cls, parts: Sequence[RowsPosterior]) -> RowsPosterior:
-        """Return the posteriors of several sets of rows as one."""
-        if len(parts) == 1:
-            return parts[0]
-        most = max(one.share.shape[-1] for one in parts)
-        same = [one.with_outcomes(most) for one in parts]
-        names = [field.name for field in fields(cls)]
-        return cls(*(np.concatenate([getattr(one, n) for one in same]) for n in names))
-
-    def with_outcomes(self, count: int) -> RowsPosterior:
-        """Return the same with more outcomes, which weigh nothing, or without such ones."""
-        more = count - self.share.shape[-1]
-        if more <= 0:
-            share, log_weight = self.share[..., :count], self.log_weight[..., :count]
-        else:
-            behind = [(0, 0), (0, 0), (0, more)]
-            share = np.pad(self.share, behind)
-            log_weight = np.pad(self.log_weight, behind, constant_values=-np.inf)
-        return replace(self, share=share, log_weight=log_weight)
+        """Return several as one."""
+        return cls(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
-def filter_rows(rows: FilterRows) -> RowsPosterior:
-    """Return what moments say of rows, one after the other."""
-    count, moments, channels = rows.mean.shape
-    size, usable = moments * channels, rows.usable
-    f, whole = rows.prior
-    log_evidence = np.zeros((count, moments))
-    alpha, ahead = np.zeros((2, count, moments, channels))
-    curvature, doubt = np.zeros((2, count, moments, channels, channels))
-    shares, weights = list[FloatArray](), list[FloatArray]()
-    for m in range(moments):
-        mixture = rows.mixture_at(m)
-        if rows.kept[:, m].any():
-            carried = _carried(mixture.log_weight, shares[-1], weights[-1], rows.kept[:, m])
-            mixture = replace(mixture, log_weight=carried)
-        weights.append(mixture.log_weight)
-        share = np.zeros(mixture.log_weight.shape)
-        some = np.flatnonzero(usable[:, m])
-        if len(some):
-            at = slice(m * channels, (m + 1) * channels)
-            here, spread = f[some, at], whole[some, at, at]
-            found = moment_posterior(mixture[some], here.T, packed(spread), rows.noise)
-            pull, B = found.alpha.T, unpacked(found.curvature)
-            log_evidence[some, m], share[:, some] = found.log_evidence, found.share
-            alpha[some, m], curvature[some, m], ahead[some, m], doubt[some, m] = (
-                pull,
-                B,
-                here,
-                spread,
-            )
-            cross = whole[some, :, at]
-            f[some] += np.matmul(cross, pull[..., None])[..., 0]
-            whole[some] -= np.matmul(np.matmul(cross, B), np.swapaxes(cross, -1, -2))
-        if m:  # a moment that was not seen leaves what was known of its movement
-            unseen = (rows.kept[:, m] > 0.0) & ~usable[:, m]
-            share = np.where(unseen, shares[-1], share)
-        shares.append(share)
-    return RowsPosterior(
-        log_evidence,
-        alpha,
-        curvature,
-        ahead,
-        doubt,
-        np.moveaxis(np.stack(shares), -1, 0),
-        np.moveaxis(np.stack(weights), -1, 0),
-        f[:, :size].reshape(count, moments, channels),
-        f[:, size:],
-        whole[:, size:, size:],
-    )
-
-
-def filter_together(
-    parts: Sequence[FilterRows], before: Sequence[RowsPosterior] | None, outcomes: Sequence[int]
-) -> list[RowsPosterior]:
-    """Return what moments say of several sets of rows, all at once.
-
-    Args:
-        parts: The sets.
-        before: What the filter has found, to weigh every moment again given all others; None: the
-            filter finds it.
-        outcomes: Of each set.
-    """
-    rows = FilterRows.joined(parts)
-    found = filter_rows(rows) if before is None else refine(rows, RowsPosterior.joined(before))
-    ends = np.cumsum([len(one.usable) for one in parts]).tolist()
-    places = [slice(*pair) for pair in zip([0, *ends[:-1]], ends, strict=True)]
-    return [found[at].with_outcomes(n) for at, n in zip(places, outcomes, strict=True)]
-
-
-def _carried(
-    log_weight: FloatArray, share: FloatArray, before: FloatArray, kept: FloatArray
-) -> FloatArray:
-    """Return the log weights of outcomes given what the moment before said of them, same axes.
-
-    What an outlier leaves open is as it was before.
-
-    Args:
-        log_weight: Weights that nothing is known of, (outcome, row).
-        share: Share of each when the moment before came, (outcome, row).
-        before: Log of its weight then, (outcome, row).
-        kept: Probability that it holds on, (row,).
-    """
-    found = log_weight.copy()
-    some = np.flatnonzero((kept > 0.0) & np.isfinite(before).any(axis=0))
-    total, stays = log_sum(log_weight[:, some], axis=0), kept[some]
-    usual = np.exp(before[:, some] - log_sum(before[:, some], axis=0))
-    known = share[:, some]
-    known = known + np.maximum(1.0 - known.sum(axis=0), 0.0) * usual
-    fresh = np.exp(log_weight[:, some] - total)
-    found[:, some] = log_of(stays * known + (1.0 - stays) * fresh) + total
+def filter_picks(tables: Tables, picks: Places, noise: Noise) -> RowsPosterior:
+    """Return what moments say of picks, one after the other."""
+    count, moments, channels = picks.lever.shape
+    found = RowsPosterior.zeros(count, moments, channels, tables.residual.shape[3])
+    _filter(tables, picks, noise, found)
     return found
-
-
-def site(
-    alpha: FloatArray, curvature: FloatArray, mean: FloatArray, covariance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return W (..., channel, channel) and b (..., channel) of the factor that stands for a moment.
-
-        Cov[f] = (K^-1 + W)^-1    W = (I - B K)^-1 B,    b = W E[f] + alpha
-
-    Args:
-        alpha: What the moment says, (..., channel).
-        curvature: B, (..., channel, channel).
-        mean: m, (..., channel) [m].
-        covariance: K, (..., channel, channel) [m2].
-    """
-    eye = np.eye(mean.shape[-1])
-    W = np.linalg.solve(eye - curvature @ covariance, curvature)
-    values, vectors = np.linalg.eigh(0.5 * (W + np.swapaxes(W, -1, -2)))
-    W = (vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    middle = mean + np.matmul(covariance, alpha[..., None])[..., 0]
-    return W, np.matmul(W, middle[..., None])[..., 0] + alpha
 
 
 AGREE_NATS = 1.5
 """A second look at the moments counts where it moves the evidence by less: else they contradict
 each other under this row, and one normal distribution does not hold what they leave open."""
+LEAST_DETERMINANT = 1e-4
+"""Determinant of I - K W from which the factor of a moment can be taken out of K without loss."""
 
 
-def refine(rows: FilterRows, found: RowsPosterior) -> RowsPosterior:
-    """Return what moments say of rows, each weighed given all others (expectation propagation).
+def refine(tables: Tables, picks: Places, noise: Noise, found: RowsPosterior) -> RowsPosterior:
+    """Return what moments say of picks, each weighed given all others (expectation propagation).
 
     With factors (W, b) of the moments, N_-m the distribution without that of m, and Z_m its
     integral,
@@ -297,132 +161,418 @@ def refine(rows: FilterRows, found: RowsPosterior) -> RowsPosterior:
                 + log integral of N(f; G mu, K) prod over m of exp(-1/2 f^T W f + b^T f)
 
     Args:
-        rows: The rows.
+        tables: What rows say.
+        picks: The picks.
+        noise: The Student t of residuals.
         found: What the filter has found.
     """
-    sites, usable = _Sites.of(rows, found), rows.usable
-    log_evidence = np.zeros(usable.shape)
-    again = RowsPosterior(*(getattr(found, field.name).copy() for field in fields(found)))
-    for m in range(usable.shape[1]):
-        some = np.flatnonzero(usable[:, m])
-        if not len(some):
-            continue
-        here, spread = sites.without(m, some)
-        mixture = replace(rows.mixture_at(m)[some], log_weight=found.log_weight[some, m].T)
-        says = moment_posterior(mixture, here.T, packed(spread), rows.noise)
-        alpha, B = says.alpha.T, unpacked(says.curvature)
-        W, b = site(alpha, B, here, spread)
-        log_evidence[some, m] = says.log_evidence - _log_integral(W, b, here, spread)
-        again.alpha[some, m], again.curvature[some, m] = alpha, B
-        again.ahead[some, m], again.doubt[some, m] = here, spread
-        again.share[some, m] = says.share.T
-        sites.put(m, some, W, b)
-    total = log_evidence.sum(axis=1) + sites.log_integral
-    again.mean[:], again.amount[:], again.amount_spread[:] = sites.moments
-    again.log_evidence[:] += (total - found.total)[:, None] / usable.shape[1]
-    agree = np.flatnonzero(np.abs(total - found.total) < AGREE_NATS)
-    return found.with_rows(agree, again[agree])
+    again = RowsPosterior(*(values.copy() for values in found))
+    _refine(tables, picks, noise, *found.sites, again)
+    agree = np.flatnonzero(np.abs(again.total - found.total) < AGREE_NATS)
+    return found.with_picks(agree, again.some(agree))
 
 
-@dataclass
-class _Sites:
-    """The normal distribution of f and z with the factors of all moments.
+@compiled
+def _prior(tables: Tables, picks: Places, i: int) -> tuple[FloatArray, FloatArray]:
+    """Return mean and covariance of f and, last, z."""
+    n, place, variance = picks.normal[i], picks.place[i], picks.amount[i]
+    size, channels = tables.covariance.shape[-1], tables.mean.shape[-1]
+    mean, whole = np.zeros(size + 1), np.zeros((size + 1, size + 1))
+    for a in range(size):
+        mean[a] = tables.mean[n, place, a // channels, a % channels]
+        lever = variance * picks.lever[i, a // channels, a % channels]
+        for b in range(size):
+            own = lever * picks.lever[i, b // channels, b % channels]
+            whole[a, b] = tables.covariance[n, place, a, b] + own
+        whole[a, size] = whole[size, a] = lever
+    whole[size, size] = variance
+    return mean, whole
 
-    Attributes:
-        prior_mean: (row, number).
-        prior: K, (row, number, number).
-        information: W of each moment, (row, moment, channel, channel).
-        shift: b, (row, moment, channel).
-        f: Mean given all factors, (row, number).
-        whole: Covariance given all factors, (row, number, number).
+
+@compiled
+def _write_scales(tables: Tables, picks: Places, i: int, m: int, scale: FloatArray) -> None:
+    """Write S_a of one moment, (outcome, channel, channel) [m2]."""
+    n, place, (factor, noise) = picks.normal[i], picks.place[i], picks.variance[i]
+    outcomes, channels, _ = scale.shape
+    for a in range(outcomes):
+        for c in range(channels):
+            for d in range(channels):
+                scatter = factor * tables.scatter[place, m, a, c, d]
+                scale[a, c, d] = scatter + tables.extra[n, place, m, a, c, d]
+            scale[a, c, c] += noise
+
+
+@compiled
+def _carry(found: RowsPosterior, i: int, m: int, kept: float) -> None:
+    """Make the log weights of outcomes those given what the moment before said of them.
+
+    What an outlier leaves open is as it was before.
+
+    Args:
+        found: With the weights that nothing is known of.
+        i: The pick.
+        m: The moment.
+        kept: Probability that the outcome of the moment before holds on.
     """
-
-    prior_mean: FloatArray
-    prior: FloatArray
-    information: FloatArray
-    shift: FloatArray
-    f: FloatArray
-    whole: FloatArray
-
-    @classmethod
-    def of(cls, rows: FilterRows, found: RowsPosterior) -> _Sites:
-        prior_mean, prior = rows.prior
-        information, shift = (part.copy() for part in found.sites)
-        f, whole = _given(prior_mean, prior, information, shift)
-        return cls(prior_mean, prior, information, shift, f, whole)
-
-    def without(self, m: int, some: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean and covariance of f_m without the factor of a moment."""
-        at = _at(m, self.shift)
-        W, spread, f = self.information[some, m], self.whole[some, at, at], self.f[some, at]
-        cavity = np.linalg.solve(np.eye(f.shape[-1]) - spread @ W, spread)
-        values, vectors = np.linalg.eigh(0.5 * (cavity + np.swapaxes(cavity, -1, -2)))
-        cavity = (vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-        pull = self.shift[some, m] - np.matmul(W, f[..., None])[..., 0]
-        return f - np.matmul(cavity, pull[..., None])[..., 0], cavity
-
-    def put(self, m: int, some: IntArray, W: FloatArray, b: FloatArray) -> None:
-        """Take the new factor of a moment."""
-        at = _at(m, self.shift)
-        more, pull = W - self.information[some, m], b - self.shift[some, m]
-        spread, f, cross = self.whole[some, at, at], self.f[some, at], self.whole[some, :, at]
-        system = np.eye(f.shape[-1]) + more @ spread
-        pull = pull - np.matmul(more, f[..., None])[..., 0]
-        alpha = np.linalg.solve(system, pull[..., None])
-        taken = np.linalg.solve(system, more)
-        self.f[some] += np.matmul(cross, alpha)[..., 0]
-        self.whole[some] -= cross @ taken @ np.swapaxes(cross, -1, -2)
-        self.information[some, m], self.shift[some, m] = W, b
-
-    @property
-    def moments(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Mean of f (row, moment, channel), mean and covariance of z (row, amount, ...)."""
-        size = self.shift.shape[1] * self.shift.shape[2]
-        f = self.f[:, :size].reshape(self.shift.shape)
-        return f, self.f[:, size:], self.whole[:, size:, size:]
-
-    @property
-    def log_integral(self) -> FloatArray:
-        """Log of the integral of the prior times all factors, (row,)."""
-        W, b = _stacked(self.information, self.shift, self.f.shape[1])
-        return _log_integral(W, b, self.prior_mean, self.prior)
+    weight, share, before = (
+        found.log_weight[i, m],
+        found.share[i, m - 1],
+        found.log_weight[i, m - 1],
+    )
+    total, all_before = log_total(weight), log_total(before)
+    if kept == 0.0 or all_before == -np.inf:
+        return
+    told = 0.0
+    for a in range(len(weight)):
+        told += share[a]
+    left = max(1.0 - told, 0.0)
+    for a in range(len(weight)):
+        if weight[a] == before[a] == -np.inf:
+            continue
+        known = share[a] + left * np.exp(before[a] - all_before)
+        fresh = np.exp(weight[a] - total)
+        weight[a] = np.log(kept * known + (1.0 - kept) * fresh) + total
 
 
-def _at(m: int, shift: FloatArray) -> slice:
-    channels = shift.shape[-1]
-    return slice(m * channels, (m + 1) * channels)
+@compiled
+def _put_aside(found: RowsPosterior, i: int, m: int, f: FloatArray, whole: FloatArray) -> None:
+    """Keep what is known of the numbers of a moment without it."""
+    channels = found.ahead.shape[-1]
+    at = m * channels
+    for c in range(channels):
+        found.ahead[i, m, c] = f[at + c]
+        for d in range(channels):
+            found.doubt[i, m, c, d] = whole[at + c, at + d]
 
 
-def _stacked(
-    information: FloatArray, shift: FloatArray, numbers: int
+@compiled
+def _integrate(
+    tables: Tables,
+    picks: Places,
+    noise: Noise,
+    found: RowsPosterior,
+    i: int,
+    m: int,
+    scale: FloatArray,
+) -> float:
+    """Write what a moment says of its numbers to `found`; return log Z. `scale` is room."""
+    _write_scales(tables, picks, i, m, scale)
+    moment = Moment(
+        tables.residual[picks.normal[i], picks.place[i], m],
+        scale,
+        found.log_weight[i, m],
+        found.ahead[i, m],
+        found.doubt[i, m],
+    )
+    return moment_integral(
+        moment, noise, found.share[i, m], found.alpha[i, m], found.curvature[i, m]
+    )
+
+
+@compiled
+def _conclude(found: RowsPosterior, i: int, f: FloatArray, whole: FloatArray) -> None:
+    """Keep what is known of f and z given all moments."""
+    _, moments, channels = found.mean.shape
+    size = moments * channels
+    for a in range(size):
+        found.mean[i, a // channels, a % channels] = f[a]
+    found.amount[i, 0], found.amount[i, 1] = f[size], whole[size, size]
+
+
+@compiled
+def _filter(tables: Tables, picks: Places, noise: Noise, found: RowsPosterior) -> None:
+    """Write what moments say of picks to `found`."""
+    count, moments, channels = picks.lever.shape
+    outcomes = found.share.shape[-1]
+    scale = np.empty((outcomes, channels, channels))
+    for i in range(count):
+        f, whole = _prior(tables, picks, i)
+        for m in range(moments):
+            for a in range(outcomes):
+                found.log_weight[i, m, a] = tables.log_weight[picks.weight_place[i], m, a]
+            if m and picks.kept[i, m] > 0.0:
+                _carry(found, i, m, picks.kept[i, m])
+                if not picks.usable[i, m]:  # leaves what was known of its movement
+                    for a in range(outcomes):
+                        found.share[i, m, a] = found.share[i, m - 1, a]
+            if picks.usable[i, m]:
+                _put_aside(found, i, m, f, whole)
+                found.log_evidence[i, m] = _integrate(tables, picks, noise, found, i, m, scale)
+                _take(f, whole, m * channels, found.alpha[i, m], found.curvature[i, m])
+        _conclude(found, i, f, whole)
+
+
+@compiled
+def _take(f: FloatArray, whole: FloatArray, at: int, pull: FloatArray, B: FloatArray) -> None:
+    """Take what a moment says of its numbers: f += K pull, K -= K B K."""
+    size, channels = len(f), len(pull)
+    cross, crossed = np.empty((size, channels)), np.empty(channels)
+    for i in range(size):
+        for c in range(channels):
+            cross[i, c] = whole[i, at + c]
+    for i in range(size):
+        for c in range(channels):
+            f[i] += cross[i, c] * pull[c]
+            crossed[c] = 0.0
+            for d in range(channels):
+                crossed[c] += cross[i, d] * B[d, c]
+        for j in range(size):
+            for c in range(channels):
+                whole[i, j] -= crossed[c] * cross[j, c]
+
+
+@compiled
+def _product(A: FloatArray, B: FloatArray) -> FloatArray:
+    """Return A B of small matrices, without the overhead of a library."""
+    found = np.zeros((A.shape[0], B.shape[1]))
+    for i in range(A.shape[0]):
+        for k in range(A.shape[1]):
+            for j in range(B.shape[1]):
+                found[i, j] += A[i, k] * B[k, j]
+    return found
+
+
+@compiled
+def _moved(A: FloatArray, x: FloatArray) -> FloatArray:
+    """Return A x of a small matrix."""
+    found = np.zeros(len(A))
+    for i in range(len(A)):
+        for k in range(len(x)):
+            found[i] += A[i, k] * x[k]
+    return found
+
+
+@compiled
+def _taken_by_site(
+    f: FloatArray, whole: FloatArray, at: int, W: FloatArray, b: FloatArray
+) -> float:
+    """Multiply N(f; mean, covariance) by the factor of a moment; return the log of its integral.
+
+    The factor is exp(-1/2 f_m^T W f_m + b^T f_m).
+    """
+    channels, value = len(b), 0.0
+    here, pull, spread = np.empty(channels), np.empty(channels), np.empty((channels, channels))
+    for c in range(channels):
+        here[c] = f[at + c]
+        for d in range(channels):
+            spread[c, d] = whole[at + c, at + d]
+    system, determinant = _inverse_beside(W, spread)
+    moved = _moved(W, here)
+    for c in range(channels):
+        pull[c] = b[c] - moved[c]
+    _take(f, whole, at, _moved(system, pull), _product(system, W))
+    for c in range(channels):
+        value += here[c] * (b[c] + pull[c]) + pull[c] * (f[at + c] - here[c])
+    return 0.5 * (value - np.log(determinant))
+
+
+@compiled
+def _inverse_beside(W: FloatArray, K: FloatArray) -> tuple[FloatArray, float]:
+    """Return (I + W K)^-1 and the determinant of I + W K."""
+    system, found = _product(W, K), np.eye(len(W))
+    for i in range(len(W)):
+        system[i, i] += 1.0
+    return found, _eliminate(system, found)
+
+
+@compiled
+def _eliminate(system: FloatArray, found: FloatArray) -> float:
+    """Multiply `found` by the inverse of a matrix, by elimination with pivots.
+
+    Returns:
+        The determinant of the matrix, which becomes the identity.
+    """
+    size, determinant = len(system), 1.0
+    for k in range(size):
+        best = k
+        for i in range(k + 1, size):
+            if abs(system[i, k]) > abs(system[best, k]):
+                best = i
+        if best != k:
+            determinant = -determinant
+            for j in range(size):
+                system[k, j], system[best, j] = system[best, j], system[k, j]
+                found[k, j], found[best, j] = found[best, j], found[k, j]
+        determinant *= system[k, k]
+        for i in range(size):
+            _subtract(system, found, i, k)
+    return determinant
+
+
+@compiled
+def _subtract(system: FloatArray, found: FloatArray, i: int, k: int) -> None:
+    """Take a row k so often from row i that column k of it is 0, or make it 1 in row k itself."""
+    factor = system[i, k] / system[k, k] if i != k else 1.0 - 1.0 / system[k, k]
+    for j in range(len(system)):
+        system[i, j] -= factor * system[k, j]
+        found[i, j] -= factor * found[k, j]
+
+
+@compiled
+def _made_positive(matrix: FloatArray) -> FloatArray:
+    """Return a matrix as the nearest that is symmetric and not negative."""
+    size = len(matrix)
+    found, test = np.empty((size, size)), np.empty((size, size))
+    for i in range(size):
+        for j in range(size):
+            found[i, j] = test[i, j] = 0.5 * (matrix[i, j] + matrix[j, i])
+    if not _is_positive(test):
+        values, vectors = np.linalg.eigh(found)
+        for i in range(size):
+            for j in range(size):
+                found[i, j] = 0.0
+                for k in range(size):
+                    found[i, j] += vectors[i, k] * max(values[k], 0.0) * vectors[j, k]
+    return found
+
+
+@compiled
+def _is_positive(matrix: FloatArray) -> bool:
+    """Return whether a symmetric matrix, which is overwritten, is positive definite."""
+    for k in range(len(matrix)):
+        if not matrix[k, k] > 0.0:
+            return False
+        for i in range(k + 1, len(matrix)):
+            for j in range(k + 1, i + 1):
+                matrix[i, j] -= matrix[i, k] * matrix[j, k] / matrix[k, k]
+    return True
+
+
+@compiled
+def _site(
+    alpha: FloatArray, B: FloatArray, mean: FloatArray, K: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the factors of all moments as one of f and z, of so many numbers."""
-    rows, moments, _ = shift.shape
-    W, b = np.zeros((rows, numbers, numbers)), np.zeros((rows, numbers))
-    for m in range(moments):
-        at = _at(m, shift)
-        W[:, at, at], b[:, at] = information[:, m], shift[:, m]
+    """Return W and b of the factor that stands for a moment.
+
+        Cov[f] = (K^-1 + W)^-1    W = (I - B K)^-1 B,    b = W E[f] + alpha
+
+    Args:
+        alpha: What the moment says.
+        B: The same.
+        mean: m [m].
+        K: Covariance of f without the moment [m2].
+    """
+    size = len(mean)
+    negative, middle = np.empty((size, size)), _moved(K, alpha)
+    for i in range(size):
+        middle[i] += mean[i]
+        for j in range(size):
+            negative[i, j] = -B[i, j]
+    W = _made_positive(_product(_inverse_beside(negative, K)[0], B))
+    b = _moved(W, middle)
+    for i in range(size):
+        b[i] += alpha[i]
     return W, b
 
 
-def _given(
-    mean: FloatArray, prior: FloatArray, information: FloatArray, shift: FloatArray
+@compiled
+def _write_site(found: RowsPosterior, i: int, m: int, W: FloatArray, b: FloatArray) -> None:
+    """Write the factor that stands for a moment to W and b."""
+    W_m, b_m = _site(found.alpha[i, m], found.curvature[i, m], found.ahead[i, m], found.doubt[i, m])
+    for c in range(len(b)):
+        b[c] = b_m[c]
+        for d in range(len(b)):
+            W[c, d] = W_m[c, d]
+
+
+@compiled
+def _write_sites(found: RowsPosterior, W: FloatArray, b: FloatArray) -> None:
+    for i in range(len(W)):
+        for m in range(W.shape[1]):
+            _write_site(found, i, m, W[i, m], b[i, m])
+
+
+@compiled
+def _take_out(found: RowsPosterior, i: int, m: int, W: FloatArray, b: FloatArray) -> bool:
+    """Take the factor of a moment out of what is known of its numbers with it.
+
+    Returns:
+        Whether that is accurate: all is lost by rounding if hardly anything else tells of them.
+    """
+    channels = len(b)
+    spread, here, negative = found.doubt[i, m], found.ahead[i, m], np.empty((channels, channels))
+    pull = _moved(W, here)
+    for c in range(channels):
+        pull[c] = b[c] - pull[c]
+        for d in range(channels):
+            negative[c, d] = -W[c, d]
+    inverse, determinant = _inverse_beside(spread, negative)
+    doubt = _made_positive(_product(inverse, spread))
+    moved = _moved(doubt, pull)
+    for c in range(channels):
+        here[c] -= moved[c]
+        for d in range(channels):
+            spread[c, d] = doubt[c, d]
+    return determinant > LEAST_DETERMINANT
+
+
+@compiled
+def _given_others(
+    tables: Tables, picks: Places, i: int, m: int, W: FloatArray, b: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean and covariance of f and z given the factors of all moments."""
-    W, b = _stacked(information, shift, mean.shape[-1])
-    system = np.eye(mean.shape[-1]) + W @ prior
-    pull = b - np.matmul(W, mean[..., None])[..., 0]
-    alpha = np.linalg.solve(system, pull[..., None])
-    whole = prior - prior @ np.linalg.solve(system, W @ prior)
-    return mean + np.matmul(prior, alpha)[..., 0], whole
+    """Return mean and covariance of f and z given the factors of all moments but one."""
+    f, whole = _prior(tables, picks, i)
+    for k in range(len(b)):
+        if k != m:
+            _taken_by_site(f, whole, k * b.shape[1], W[k], b[k])
+    return f, whole
 
 
-def _log_integral(
-    W: FloatArray, b: FloatArray, mean: FloatArray, covariance: FloatArray
-) -> FloatArray:
-    """Return log of the integral of N(f; mean, covariance) exp(-1/2 f^T W f + b^T f), (row,)."""
-    system = np.eye(mean.shape[-1]) + W @ covariance
-    pull = b - np.matmul(W, mean[..., None])[..., 0]
-    moved = np.matmul(covariance, np.linalg.solve(system, pull[..., None]))[..., 0]
-    value = np.sum(mean * (b + pull), axis=-1) + np.sum(pull * moved, axis=-1)
-    return np.asarray(0.5 * (value - np.linalg.slogdet(system)[1]))
+@compiled
+def _exchange(
+    found: RowsPosterior,
+    i: int,
+    m: int,
+    f: FloatArray,
+    whole: FloatArray,
+    W: FloatArray,
+    b: FloatArray,
+) -> float:
+    """Put a new factor of a moment in the place of the one before, in f and in W and b.
+
+    Returns:
+        The log integral of the new factor over its numbers without it.
+    """
+    channels = len(b)
+    more, pull = np.empty((channels, channels)), np.empty(channels)
+    mean, covariance = np.empty(channels), np.empty((channels, channels))
+    for c in range(channels):
+        pull[c], mean[c] = -b[c], found.ahead[i, m, c]
+        for d in range(channels):
+            more[c, d], covariance[c, d] = -W[c, d], found.doubt[i, m, c, d]
+    _write_site(found, i, m, W, b)
+    for c in range(channels):
+        pull[c] += b[c]
+        for d in range(channels):
+            more[c, d] += W[c, d]
+    _taken_by_site(f, whole, m * channels, more, pull)
+    return _taken_by_site(mean, covariance, 0, W, b)
+
+
+@compiled
+def _refine(
+    tables: Tables, picks: Places, noise: Noise, W: FloatArray, b: FloatArray, found: RowsPosterior
+) -> None:
+    """Write what each moment says given all others to `found`; W and b are written too."""
+    count, moments, channels = picks.lever.shape
+    scale = np.empty((found.share.shape[-1], channels, channels))
+    for i in range(count):
+        f, whole = _prior(tables, picks, i)
+        for m in range(moments):
+            _taken_by_site(f, whole, m * channels, W[i, m], b[i, m])
+        gained = 0.0
+        for m in range(moments):
+            gained -= found.log_evidence[i, m]
+            if picks.usable[i, m]:
+                _put_aside(found, i, m, f, whole)
+                if not _take_out(found, i, m, W[i, m], b[i, m]):
+                    mean, covariance = _given_others(tables, picks, i, m, W[i], b[i])
+                    _put_aside(found, i, m, mean, covariance)
+                gained += _integrate(tables, picks, noise, found, i, m, scale)
+                gained -= _exchange(found, i, m, f, whole, W[i, m], b[i, m])
+        f, whole = _prior(tables, picks, i)
+        for m in range(moments):
+            gained += _taken_by_site(f, whole, m * channels, W[i, m], b[i, m])
+        _conclude(found, i, f, whole)
+        for m in range(moments):
+            found.log_evidence[i, m] += gained / moments

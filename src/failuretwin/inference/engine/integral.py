@@ -1,4 +1,4 @@
-"""The integral of one moment: what the sensors say at one time, under many hypotheses at once.
+"""The integral of one moment: what the sensors say at one time.
 
     Z = integral of N(f; m, K) [ sum over a of w_a t_nu(r_a - f; S_a) + outlier ] df
 
@@ -11,24 +11,22 @@ covariance of f are sums in closed form. With C_aq = K + S_a / lambda_q and thei
     Cov[f] = K - K B K
 
 Laplace's method at the mode, with the expected information as curvature, takes an unknown moment
-for half a nat more than it says; these moments are exact. Arrays have rows of hypotheses last, and
-matrices are packed (`symmetric`), so that each step runs over all rows at once.
+for half a nat more than it says; these moments are exact.
 
 Section: docs/inference.md#integral
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from functools import cached_property, lru_cache
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
+from failuretwin.core.compiled import compiled
 from failuretwin.core.numerics import log_fall, log_norm
-from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.inference.engine import symmetric
+from failuretwin.core.types import FloatArray
 
 NORMALS = 5
 """Normal distributions that stand for a Student t."""
@@ -39,6 +37,8 @@ NEARLY_NORMAL = 200.0
 KEPT_NATS = 5.0
 """Outcomes of a moment that are integrated in full: the best, and those so near to it or to the
 outlier; the rest count with their density."""
+NEGLIGIBLE = 1e-14
+"""Normal distributions with a smaller share pull at nothing."""
 
 
 @lru_cache
@@ -67,214 +67,249 @@ def scale_mixture(dof: float, dims: int) -> tuple[FloatArray, FloatArray]:
     return np.exp(found.x[:NORMALS]), found.x[NORMALS:]
 
 
-@dataclass(frozen=True)
-class Noise:
+class Noise(NamedTuple):
     """Student t of the residuals.
 
     Attributes:
         dof: Degrees of freedom nu.
         dims: Dimension d of the density.
         log_outlier: Log density of a tool anywhere, times its rate [log 1/m^d].
+        log_norm: Log of the constant of the density.
+        factors: lambda of the normal distributions that stand for it, (normal,).
+        log_omega: Their log weights, (normal,).
     """
 
     dof: float
     dims: int
     log_outlier: float
+    log_norm: float
+    factors: FloatArray
+    log_omega: FloatArray
 
-    @cached_property
-    def log_norm(self) -> float:
-        """Log of the constant of the density."""
-        return log_norm(self.dof, self.dims)
-
-    def log_density(self, square: FloatArray, log_determinant: FloatArray) -> FloatArray:
-        """Return the log density at a squared distance, with the log determinant of the scale."""
-        return self.log_norm - 0.5 * log_determinant + log_fall(square, self.dof, self.dims)
+    @classmethod
+    def of(cls, dof: float, dims: int, log_outlier: float) -> Noise:
+        """Return a Student t of so many degrees of freedom and dimensions."""
+        return cls(
+            float(dof), dims, float(log_outlier), log_norm(dof, dims), *scale_mixture(dof, dims)
+        )
 
 
-@dataclass(frozen=True)
-class Mixture:
-    """The outcomes of one moment.
+@compiled
+def log_density(noise: Noise, square: float, determinant: float) -> float:
+    """Return the log density at a squared distance, with the determinant of the scale."""
+    if np.isinf(noise.dof):
+        fall = -0.5 * square
+    else:
+        fall = -0.5 * (noise.dof + noise.dims) * np.log1p(square / noise.dof)
+    return noise.log_norm - 0.5 * np.log(determinant) + fall
+
+
+@compiled
+def invert(matrix: FloatArray) -> float:
+    """Replace a positive definite matrix by its inverse; return its determinant.
+
+    Of three channels by its adjugate, of others one sweep a channel k: with b = A_kk,
+    A_ij <- A_ij - A_ik A_jk / b,    A_ik <- A_ik / b,    A_kk <- -1 / b    make -A^-1 of A.
+    """
+    size, determinant = len(matrix), 1.0
+    if size == 3:
+        a, b, c = matrix[0, 0], matrix[1, 0], matrix[1, 1]
+        d, e, f = matrix[2, 0], matrix[2, 1], matrix[2, 2]
+        first, second, third = c * f - e * e, d * e - b * f, b * e - c * d
+        determinant = a * first + b * second + d * third
+        factor = 1.0 / determinant
+        matrix[0, 0], matrix[1, 1] = first * factor, (a * f - d * d) * factor
+        matrix[2, 2] = (a * c - b * b) * factor
+        matrix[0, 1] = matrix[1, 0] = second * factor
+        matrix[0, 2] = matrix[2, 0] = third * factor
+        matrix[1, 2] = matrix[2, 1] = (b * d - a * e) * factor
+        return determinant
+    for k in range(size):
+        pivot = matrix[k, k]
+        determinant *= pivot
+        for i in range(size):
+            if i != k:
+                scaled = matrix[i, k] / pivot
+                for j in range(size):
+                    if j != k:
+                        matrix[i, j] -= scaled * matrix[k, j]
+        for i in range(size):
+            matrix[i, k] /= pivot
+            matrix[k, i] = matrix[i, k]
+        matrix[k, k] = -1.0 / pivot
+    for i in range(size):
+        for j in range(size):
+            matrix[i, j] = -matrix[i, j]
+    return determinant
+
+
+Work = tuple[FloatArray, FloatArray]
+"""Room for a matrix and a vector of channels."""
+
+
+class Moment(NamedTuple):
+    """One moment under one row.
 
     Attributes:
-        residual: r_a, (channel, outcome, row) [m].
-        scale: S_a, packed, (entry, outcome, row) [m2].
-        log_weight: log w_a, (outcome, row).
+        residual: r_a, (outcome, channel) [m].
+        scale: S_a, (outcome, channel, channel) [m2].
+        log_weight: log w_a, (outcome,).
+        mean: m, (channel,) [m].
+        covariance: K, (channel, channel) [m2].
     """
 
     residual: FloatArray
     scale: FloatArray
     log_weight: FloatArray
-
-    def __getitem__(self, rows: IntArray) -> Mixture:
-        """Return some of the rows."""
-        if len(rows) == self.log_weight.shape[-1]:  # all of them
-            return self
-        return Mixture(self.residual[..., rows], self.scale[..., rows], self.log_weight[:, rows])
-
-    @classmethod
-    def joined(cls, parts: Sequence[Mixture]) -> Mixture:
-        """Return the rows of several mixtures as one; outcomes that a row has not weigh nothing."""
-        if len(parts) == 1:
-            return parts[0]
-        most = max(len(one.log_weight) for one in parts)
-        padded = [one._padded(most - len(one.log_weight)) for one in parts]
-        names = [field.name for field in fields(cls)]
-        return cls(*(np.concatenate([getattr(one, n) for one in padded], -1) for n in names))
-
-    def _padded(self, more: int) -> Mixture:
-        """Return the same with more outcomes, as the last one, that weigh nothing."""
-        if more == 0:
-            return self
-        last = [(0, 0), (0, more), (0, 0)]
-        return Mixture(
-            np.pad(self.residual, last, mode="edge"),
-            np.pad(self.scale, last, mode="edge"),
-            np.pad(self.log_weight, last[1:], constant_values=-np.inf),
-        )
-
-    @property
-    def by_row(self) -> tuple[FloatArray, FloatArray]:
-        """r_a (row, outcome, channel) and S_a (row, outcome, channel, channel)."""
-        return self.residual.T, np.swapaxes(symmetric.unpacked(self.scale), 0, 1)
+    mean: FloatArray
+    covariance: FloatArray
 
 
-@dataclass(frozen=True)
-class MomentPosterior:
-    """What one moment says.
+@compiled
+def _whitened(
+    moment: Moment, a: int, factor: float, precision: FloatArray, pull: FloatArray
+) -> tuple[float, float]:
+    """Write C^-1 and C^-1 (r - m) of C = K + S_a / factor.
 
-    Attributes:
-        log_evidence: log Z, (row,).
-        alpha: (channel, row).
-        curvature: B, packed, (entry, row).
-        share: Share of each outcome, (outcome, row); what is missing to 1 is the outlier's.
+    Returns:
+        Squared distance of the outcome, and the determinant of C.
     """
-
-    log_evidence: FloatArray
-    alpha: FloatArray
-    curvature: FloatArray
-    share: FloatArray
-
-
-def moment_posterior(
-    mixture: Mixture, mean: FloatArray, covariance: FloatArray, noise: Noise
-) -> MomentPosterior:
-    """Return what one moment says of f ~ N(mean, covariance).
-
-    Args:
-        mixture: The outcomes under each row.
-        mean: m, (channel, row) [m].
-        covariance: K, packed, (entry, row) [m2].
-        noise: The Student t of residuals.
-    """
-    error = mixture.residual - mean[:, None]
-    precision, log_determinant = symmetric.inverse(mixture.scale + covariance[:, None])
-    square = symmetric.dot(error, symmetric.times(precision, error))
-    glance = mixture.log_weight + noise.log_density(square, log_determinant)
-    best = np.argmax(glance, axis=0)
-    highest = glance[best, np.arange(len(best))]
-    kept = glance > np.maximum(highest, noise.log_outlier) - KEPT_NATS
-    kept[best, np.arange(len(best))] = True
-    row, outcome = np.nonzero(kept.T)  # outcomes of a row stand together
-    begin = np.flatnonzero(np.diff(row, prepend=-1))
-    terms = _Terms.of(
-        error[:, outcome, row],
-        mixture.scale[:, outcome, row],
-        mixture.log_weight[outcome, row],
-        covariance[:, row],
-        noise,
+    residual, scale, mean, covariance = (
+        moment.residual,
+        moment.scale,
+        moment.mean,
+        moment.covariance,
     )
-    # What is left of f counts as scatter at the glance: wrong by as much for the others.
-    exact = _log_sum_by_row(terms.log_height, begin, row)
-    rough = _log_sum_by_row(glance[outcome, row], begin, row)
-    possible = np.isfinite(exact) & np.isfinite(rough)
-    ratio = np.where(possible, exact - np.where(possible, rough, 0.0), 0.0)
-    rest = np.where(kept, -np.inf, glance + ratio)
-    top = np.maximum(np.where(possible, exact, -np.inf), noise.log_outlier)
-    share = np.exp(rest - top)
-    left = share.sum(axis=0)
-    height = np.exp(terms.log_height - top[row])
-    of_kept = np.add.reduceat(height, begin)
-    total = of_kept + left + np.exp(noise.log_outlier - top)
-    share[outcome, row] = height
-    share /= total
-    # Those that are left pull as these do.
-    counted = (1.0 + left / np.maximum(of_kept, 1e-300)) / total
-    alpha, curvature = terms.pooled(top, row, begin, counted)
-    return MomentPosterior(top + np.log(total), alpha, curvature, share)
+    size, square, share = len(pull), 0.0, 1.0 / factor
+    for i in range(size):
+        for j in range(size):
+            precision[i, j] = covariance[i, j] + scale[a, i, j] * share
+    determinant = invert(precision)
+    for i in range(size):
+        total = 0.0
+        for j in range(size):
+            total += precision[i, j] * (residual[a, j] - mean[j])
+        pull[i] = total
+        square += total * (residual[a, i] - mean[i])
+    return square, determinant
 
 
-@dataclass(frozen=True)
-class _Terms:
-    """Outcomes of all rows that are integrated in full, (term,) each.
+@compiled
+def _write_glance(moment: Moment, noise: Noise, work: Work, glance: FloatArray) -> int:
+    """Write log weight and density of each outcome, what is left of f as scatter.
 
-    Attributes:
-        log_height: Log of weight times integral.
-        log_normal: The same of each normal distribution, (normal, term).
-        pull: C^-1 (r - m), (channel, normal, term).
-        precision: C^-1, packed, (entry, normal, term).
+    Returns:
+        The likeliest outcome.
     """
-
-    log_height: FloatArray
-    log_normal: FloatArray
-    pull: FloatArray
-    precision: FloatArray
-
-    @classmethod
-    def of(
-        cls,
-        error: FloatArray,
-        scale: FloatArray,
-        log_weight: FloatArray,
-        covariance: FloatArray,
-        noise: Noise,
-    ) -> _Terms:
-        """Integrate outcomes: r - m (channel, term), S and K packed, log w (term,)."""
-        factors, log_omega = scale_mixture(noise.dof, noise.dims)
-        total = covariance[:, None] + scale[:, None] / factors[:, None]
-        precision, log_determinant = symmetric.inverse(total)
-        error = error[:, None]
-        pull = symmetric.times(precision, error)
-        surplus = 0.5 * (len(error) - noise.dims) * np.log(factors)
-        constant = log_omega - surplus - 0.5 * noise.dims * np.log(2.0 * np.pi)
-        log_normal = -0.5 * (symmetric.dot(error, pull) + log_determinant)
-        log_normal += constant[:, None]
-        log_normal += log_weight
-        top = log_normal.max(axis=0)
-        safe = np.where(np.isfinite(top), top, 0.0)
-        with np.errstate(divide="ignore"):
-            log_height = np.log(np.exp(log_normal - safe).sum(axis=0)) + safe
-        return cls(log_height, log_normal, pull, precision)
-
-    def pooled(
-        self, top: FloatArray, row: IntArray, begin: IntArray, counted: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return alpha (channel, row) and B (entry, row), summed over the terms of each row.
-
-        Args:
-            top: Log of what heights are shares of, (row,).
-            row: Row of each term.
-            begin: First term of each row, (row,).
-            counted: Factor on the heights of each row, (row,).
-        """
-        share = np.exp(self.log_normal - top[row]) * counted[row]
-        pulled = share * self.pull
-        alpha = np.add.reduceat(pulled.sum(axis=1), begin, axis=-1)
-        rows, columns = symmetric.entries(len(alpha))
-        curvature = share * self.precision - pulled[rows] * self.pull[columns]
-        return alpha, np.add.reduceat(curvature.sum(axis=1), begin, axis=-1) + symmetric.outer(
-            alpha
-        )
+    best = 0
+    for a in range(len(glance)):
+        glance[a] = -np.inf
+        if moment.log_weight[a] > -np.inf:
+            square, determinant = _whitened(moment, a, 1.0, *work)
+            glance[a] = moment.log_weight[a] + log_density(noise, square, determinant)
+        if glance[a] > glance[best]:
+            best = a
+    return best
 
 
-def _log_sum_by_row(values: FloatArray, begin: IntArray, row: IntArray) -> FloatArray:
-    """Return log(sum(exp(values))) of the terms of each row, (row,).
+@compiled
+def _write_heights(
+    moment: Moment, noise: Noise, work: Work, a: int, top: float, height: FloatArray
+) -> float:
+    """Write weight times integral of the normal distributions of an outcome, over exp(top).
+
+    Returns:
+        Their sum.
+    """
+    size, total = len(moment.mean), 0.0
+    for q in range(len(height)):
+        factor = noise.factors[q]
+        square, determinant = _whitened(moment, a, factor, *work)
+        surplus = 0.5 * (size - noise.dims) * np.log(factor)
+        constant = noise.log_omega[q] - surplus - 0.5 * noise.dims * np.log(2.0 * np.pi)
+        log_height = constant + moment.log_weight[a] - 0.5 * square - top
+        height[q] = np.exp(log_height) / np.sqrt(determinant)
+        total += height[q]
+    return total
+
+
+@compiled
+def _write_pooled(
+    moment: Moment,
+    noise: Noise,
+    work: Work,
+    share: FloatArray,
+    alpha: FloatArray,
+    curvature: FloatArray,
+) -> None:
+    """Write alpha and B by the share of each normal distribution, (outcome, normal)."""
+    size, (precision, pull) = len(alpha), work
+    for a in range(len(share)):
+        for q in range(share.shape[1]):
+            weight = share[a, q]
+            if weight > NEGLIGIBLE:
+                _whitened(moment, a, noise.factors[q], precision, pull)
+                for i in range(size):
+                    alpha[i] += weight * pull[i]
+                    for j in range(size):
+                        curvature[i, j] += weight * (precision[i, j] - pull[i] * pull[j])
+    for i in range(size):
+        for j in range(size):
+            curvature[i, j] += alpha[i] * alpha[j]
+
+
+@compiled
+def moment_integral(
+    moment: Moment, noise: Noise, share: FloatArray, alpha: FloatArray, curvature: FloatArray
+) -> float:
+    """Return log Z of f ~ N(m, K); write what the moment says.
 
     Args:
-        values: (term,).
-        begin: First term of each row.
-        row: Row of each term.
+        moment: The outcomes of the moment.
+        noise: The Student t of residuals.
+        share: Share of each outcome, (outcome,), written; what is missing to 1 is the outlier's.
+        alpha: (channel,), written.
+        curvature: B, (channel, channel), written.
     """
-    top = np.maximum.reduceat(values, begin)
-    safe = np.where(np.isfinite(top), top, 0.0)
-    with np.errstate(divide="ignore"):
-        return np.log(np.add.reduceat(np.exp(values - safe[row]), begin)) + safe
+    count, size, glance = len(share), len(alpha), share
+    work = np.empty((size, size)), np.empty(size)
+    best = _write_glance(moment, noise, work, glance)
+    top = max(glance[best], noise.log_outlier)
+    height, exact, rough = np.zeros((count, len(noise.factors))), 0.0, 0.0
+    kept = np.zeros(count, dtype=np.bool_)
+    for a in range(count):
+        kept[a] = glance[a] > top - KEPT_NATS or (a == best and glance[a] > -np.inf)
+        if kept[a]:
+            rough += np.exp(glance[a] - top)
+            share[a] = _write_heights(moment, noise, work, a, top, height[a])
+            exact += share[a]
+    # What is left of f counts as scatter at the glance: wrong by as much for the others.
+    ratio, left = exact / rough if rough > 0.0 and exact > 0.0 else 1.0, 0.0
+    for a in range(count):
+        if not kept[a]:
+            share[a] = np.exp(glance[a] - top) * ratio
+            left += share[a]
+    whole = exact + left + np.exp(noise.log_outlier - top)
+    # Those that are left pull as these do.
+    counted = (1.0 + left / max(exact, 1e-300)) / whole
+    for a in range(count):
+        share[a] /= whole
+        for q in range(height.shape[1]):
+            height[a, q] *= counted
+    alpha[:], curvature[:] = 0.0, 0.0
+    _write_pooled(moment, noise, work, height, alpha, curvature)
+    return float(top + np.log(whole))
+
+
+@compiled
+def log_total(values: FloatArray) -> float:
+    """Return log(sum(exp(values))); -inf where all are."""
+    top = -np.inf
+    for a in range(len(values)):
+        top = max(top, values[a])
+    if not np.isfinite(top):
+        return float(top)
+    total = 0.0
+    for a in range(len(values)):
+        total += np.exp(values[a] - top)
+    return float(top + np.log(total))

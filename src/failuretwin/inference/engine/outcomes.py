@@ -62,20 +62,22 @@ class Outcomes:
             extra = np.matmul(jacobian * beside[..., None, :], transposed)
         return cls(point - expected, scatter, extra)
 
+    @property
+    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """All that is known of them, in the order of attributes."""
+        return self.residual, self.scatter, self.beside
+
     def with_rows(self) -> Outcomes:
         """Return the same with an axis for rows behind that of runs."""
-        return Outcomes(self.residual[:, None], self.scatter[:, None], self.beside[:, None])
+        return Outcomes(*(x[:, None] for x in self.arrays))
 
     def rows_first(self) -> Outcomes:
         """Return outcomes (run, moment, row, ...) as (run, row, moment, ...)."""
-        parts = (self.residual, self.scatter, self.beside)
-        return Outcomes(*(np.swapaxes(x, 1, 2) for x in parts))
+        return Outcomes(*(np.swapaxes(x, 1, 2) for x in self.arrays))
 
     @classmethod
     def joined(cls, *parts: Outcomes) -> Outcomes:
         """Return the outcomes of several sets, (run, moment, outcome, ...)."""
-
-        def join(name: str) -> FloatArray:
-            return np.concatenate([getattr(part, name) for part in parts], axis=2)
-
-        return cls(join("residual"), join("scatter"), join("beside"))
+        return cls(
+            *(np.concatenate(x, axis=2) for x in zip(*(p.arrays for p in parts), strict=True))
+        )

@@ -14,11 +14,11 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from failuretwin.core.compiled import compiled
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.engine.filter import FilterRows
-from failuretwin.inference.engine.integral import Mixture
+from failuretwin.inference.engine.filter import Places, RowsPosterior, Tables, filter_picks, refine
+from failuretwin.inference.engine.outcomes import Outcomes
 from failuretwin.inference.engine.rows import Rows, Scene
-from failuretwin.inference.engine.symmetric import identity, packed
 from failuretwin.inference.engine.theta import Components
 
 
@@ -53,34 +53,23 @@ class Picks:
 
 @dataclass(frozen=True)
 class Prepared:
-    """Rows of a hypothesis with what does not depend on scatter and noise, an array an entry.
+    """Rows of a hypothesis with what does not depend on scatter and noise.
 
     A place is a row of a run, or a run where all of its rows share their outcomes.
 
     Attributes:
+        tables: What rows say, of one normal distribution of theta or of each.
         place: Index of each row among the places, (run, row); -1: it is left out.
-        residual: r_a less what theta moves it by beside f, (normal, moment, channel, outcome,
-            place) [m].
-        scatter: J diag(s^2) J^T, packed, (moment, entry, outcome, place) [m2].
-        extra: Variance of single motors, and of theta where outcomes differ from f, packed,
-            (normal, moment, entry, outcome, place) [m2].
+        weight_place: Index of each row among the weights of outcomes, (run, row).
         columns: G of f, (place, moment, channel, theta).
-        f: Mean (normal, place, moment, channel) and covariance (normal, place, number, number) of
-            f in each normal distribution of theta.
         kept: Outcomes that are looked at, (place, moment, outcome); None: all, in their order.
-        log_weight: Log probability of each, (moment, outcome, row of a run).
-        weight_place: Index of each row among those of `log_weight`, (run, row).
     """
 
+    tables: Tables
     place: IntArray
-    residual: FloatArray
-    scatter: FloatArray
-    extra: FloatArray
-    columns: FloatArray
-    f: tuple[FloatArray, FloatArray]
-    kept: IntArray | None
-    log_weight: FloatArray
     weight_place: IntArray
+    columns: FloatArray
+    kept: IntArray | None
 
 
 def prepared(rows: Rows, components: Components) -> Prepared:
@@ -100,64 +89,88 @@ def prepared(rows: Rows, components: Components) -> Prepared:
     def flat(array: FloatArray) -> FloatArray:
         return array.reshape(runs * own, *array.shape[2:])
 
-    G = flat(rows.columns)
-    outcomes, unknown = rows.outcomes, components.unknown
-    theta = _some(components.theta(run, int(components.normal[0])), unknown)
-    G_u = G[..., unknown]
-    mean, spread = _apart(G_u - G_u[:, :, :1], *theta)
-    return _prepared(
-        place,
-        every,
-        (flat(outcomes.residual), flat(outcomes.scatter), flat(outcomes.beside)),
-        [(mean[:, :, rows.usual], spread[:, :, rows.usual])],
-        (G[:, :, 0], G_u[:, :, 0]),
-        [theta],
-        rows.log_weight.reshape(runs * count, *rows.log_weight.shape[2:]),
-        None,
-    )
+    outcomes = Outcomes(*(flat(x) for x in rows.outcomes.arrays))
+    log_weight = rows.log_weight.reshape(runs * count, *rows.log_weight.shape[2:])
+    first = int(components.normal[0])
+    tables = _tables(outcomes, log_weight, flat(rows.columns), rows.usual, components, run, [first])
+    return Prepared(tables, place, every, flat(rows.columns)[:, :, 0], None)
 
 
-def _prepared(
-    place: IntArray,
-    weight_place: IntArray,
-    outcomes: tuple[FloatArray, FloatArray, FloatArray],
-    apart: Sequence[tuple[FloatArray, FloatArray]],
-    columns: tuple[FloatArray, FloatArray],
-    theta: Sequence[tuple[FloatArray, FloatArray]],
+def _tables(
+    outcomes: Outcomes,
     log_weight: FloatArray,
-    kept: IntArray | None,
-) -> Prepared:
-    """Return rows in the order of the filter.
+    G: FloatArray,
+    usual: IntArray,
+    components: Components,
+    run: IntArray,
+    normals: Sequence[int],
+) -> Tables:
+    """Return what rows say of outcomes and of f in some normal distributions of theta.
 
     Args:
-        place: See `Prepared`.
-        weight_place: See there.
-        outcomes: Residual, scatter and beside, (place, moment, outcome, ...) each.
-        apart: What outcomes differ by in each normal distribution: mean and covariance, same axes.
-        columns: G of f, (place, moment, channel, theta), and of what is unknown in theta.
-        theta: V and mu of what is unknown at each place, in each normal distribution.
-        log_weight: (row of a run, moment, outcome).
-        kept: See `Prepared`.
+        outcomes: (place, moment, outcome, ...).
+        log_weight: (weight place, moment, outcome).
+        G: Columns of usual outcomes, (place, moment, usual, channel, theta).
+        usual: Usual outcome of each outcome.
+        components: What is believed of the robot.
+        run: Of each place.
+        normals: Which normal distributions.
     """
-    residual, scatter, beside = outcomes
-    G, G_u = columns
-    normals = [_normal_of(G_u, *one) for one in theta]
-    return Prepared(
-        place,
-        np.stack([_rows_last(np.moveaxis(residual - mean, -1, 0)) for mean, _ in apart]),
-        _rows_last(packed(scatter)),
-        np.stack([_rows_last(packed(beside + spread)) for _, spread in apart]),
-        G,
-        (np.stack([mean for mean, _ in normals]), np.stack([spread for _, spread in normals])),
-        kept,
-        np.ascontiguousarray(np.moveaxis(log_weight, 0, -1)),
-        weight_place,
+    unknown, G = components.unknown, np.ascontiguousarray(G)
+    of_f = G[:, :, 0][..., unknown].reshape(len(G), G.shape[1] * G.shape[3], len(unknown))
+    means, covariances, residuals, extras = [], [], [], []
+    for normal in normals:
+        V, mu = components.theta(run, normal)
+        V, mu = V[:, unknown[:, None], unknown], np.ascontiguousarray(mu[:, unknown])
+        variance = np.ascontiguousarray(np.diagonal(V, axis1=1, axis2=2))
+        shift, spread = np.zeros(G.shape[:4]), np.zeros((*G.shape[:4], G.shape[3]))
+        _add_apart(G, unknown, variance, mu, shift, spread)
+        residuals.append(outcomes.residual - shift[:, :, usual])
+        extras.append(outcomes.beside + spread[:, :, usual])
+        means.append((of_f @ mu[..., None]).reshape(*G.shape[:2], G.shape[3]))
+        covariances.append(of_f @ V @ np.swapaxes(of_f, 1, 2))
+    tables = (
+        np.stack(residuals),
+        outcomes.scatter,
+        np.stack(extras),
+        log_weight,
+        np.stack(means),
+        np.stack(covariances),
     )
+    return Tables(*(np.ascontiguousarray(table) for table in tables))
 
 
-def _rows_last(array: FloatArray) -> FloatArray:
-    """Return (entry, place, moment, outcome) as (moment, entry, outcome, place)."""
-    return np.ascontiguousarray(np.transpose(array, (2, 0, 3, 1)))
+@compiled
+def _add_apart(
+    G: FloatArray,
+    unknown: IntArray,
+    variance: FloatArray,
+    mu: FloatArray,
+    shift: FloatArray,
+    spread: FloatArray,
+) -> None:
+    """Add what outcomes differ by from f, as if parts of theta were independent.
+
+    Args:
+        G: Columns, (place, moment, outcome, channel, theta).
+        unknown: Places in theta that are not known.
+        variance: Of these, (place, unknown).
+        mu: Their mean, same axes.
+        shift: Mean of the difference, (place, moment, outcome, channel) [m].
+        spread: Its covariance, (place, moment, outcome, channel, channel) [m2].
+    """
+    places, moments, outcomes, channels, _ = G.shape
+    off = np.zeros(channels)
+    for p in range(places):
+        for m in range(moments):
+            for a in range(1, outcomes):
+                for t, at in enumerate(unknown):
+                    for c in range(channels):
+                        off[c] = G[p, m, a, c, at] - G[p, m, 0, c, at]
+                        shift[p, m, a, c] += off[c] * mu[p, t]
+                    for c in range(channels):
+                        for d in range(channels):
+                            spread[p, m, a, c, d] += off[c] * off[d] * variance[p, t]
 
 
 @dataclass(frozen=True)
@@ -199,73 +212,56 @@ class Part:
         assert self.prepared.kept is not None
         return self.prepared.kept[self.place]
 
+    def filtered(self) -> RowsPosterior:
+        """Return what moments say, one after the other."""
+        return filter_picks(self.prepared.tables, self._places, self.scene.noise)
+
+    def refined(self, found: RowsPosterior) -> RowsPosterior:
+        """Return what moments say, each given all others, after what the filter has found."""
+        return refine(self.prepared.tables, self._places, self.scene.noise, found)
+
     @property
-    def filter_rows(self) -> FilterRows:
-        """What the filter takes."""
-        picks, (mean, covariance) = self.picks, self.prepared.f
-        normal = self._normal
-        return FilterRows(
-            self.mixture_at,
+    def _places(self) -> Places:
+        picks, component = self.picks, self.picks.component
+        factor, noise = self.components.sigma[component], self.components.noise_m[component]
+        return Places(
+            self._prepared_normal,
+            self.place,
+            self.prepared.weight_place[picks.run, picks.row],
+            np.stack([factor, noise], axis=1) ** 2,
             self.scene.moments.usable[picks.run],
             _kept(self.scene, self.rows, picks),
-            mean[normal, self.place],
-            covariance[normal, self.place],
-            self.rows.lever[picks.run, picks.row, ..., None],
-            self.rows.variance[picks.run, picks.row, None],
-            self.scene.noise,
+            self.rows.lever[picks.run, picks.row],
+            self.rows.variance[picks.run, picks.row],
         )
 
     @property
-    def _normal(self) -> IntArray:
-        """The same among those that are prepared."""
-        only = len(self.prepared.residual) == 1
+    def _prepared_normal(self) -> IntArray:
+        """The normal distribution of theta of each pick, among those that are prepared."""
+        only = len(self.prepared.tables.mean) == 1
         return np.zeros_like(self.picks.run) if only else self.normal
 
-    def mixture_at(self, m: int) -> Mixture:
-        """Return the outcomes of a moment under each pick."""
-        known, place, component = self.prepared, self.place, self.picks.component
-        residual = _of_picks(known.residual[:, m], self._normal, place)
-        factor, noise = self.components.sigma[component], self.components.noise_m[component]
-        scale = np.take(known.scatter[m], place, axis=-1)
-        scale *= factor**2
-        scale += _of_picks(known.extra[:, m], self._normal, place)
-        scale += (identity(len(residual))[:, None] * noise**2)[:, None]
-        at = known.weight_place[self.picks.run, self.picks.row]
-        return Mixture(residual, scale, np.take(known.log_weight[m], at, axis=-1))
+    @property
+    def prior(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (pick, number) and covariance (pick, number, number) of f [m, m2]."""
+        places, tables = self._places, self.prepared.tables
+        at = places.normal, places.place
+        mean = tables.mean[at].reshape(len(places.place), tables.covariance.shape[-1])
+        lever = places.lever.reshape(mean.shape)
+        own = places.amount[:, None, None] * lever[:, :, None] * lever[:, None]
+        return mean, tables.covariance[at] + own
 
+    @property
+    def log_weight(self) -> FloatArray:
+        """Log probability of each outcome, (pick, moment, outcome)."""
+        return self.prepared.tables.log_weight[self._places.weight_place]
 
-def _of_picks(values: FloatArray, normal: IntArray, place: IntArray) -> FloatArray:
-    """Return values (normal, ..., place) of picks, (..., pick)."""
-    if len(values) == 1:
-        return np.take(values[0], place, axis=-1)
-    return np.ascontiguousarray(np.moveaxis(values[normal, ..., place], 0, -1))
-
-
-def _some(theta: tuple[FloatArray, FloatArray], which: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return V and mu of some places in theta."""
-    V, mu = theta
-    return V[:, which[:, None], which], mu[:, which]
-
-
-def _normal_of(G: FloatArray, V: FloatArray, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return f by G (place, moment, channel, theta): mean, and covariance of all its numbers."""
-    places, moments, channels, size = G.shape
-    flat = G.reshape(places, moments * channels, size)
-    mean = np.matmul(flat, mu[..., None]).reshape(places, moments, channels)
-    return mean, flat @ V @ np.swapaxes(flat, -1, -2)
-
-
-def _apart(apart: FloatArray, V: FloatArray, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return mean and covariance of what outcomes differ by, as if theta were independent.
-
-    Args:
-        apart: G of each outcome less that of f, (place, moment, outcome, channel, theta).
-        V: (place, theta, theta).
-        mu: (place, theta).
-    """
-    scaled = apart * np.sqrt(np.diagonal(V, axis1=-2, axis2=-1))[:, None, None, None]
-    shift = np.matmul(apart, mu[:, None, None, :, None])[..., 0]
-    return shift, np.matmul(scaled, np.swapaxes(scaled, -1, -2))
+    def outcomes_at(self, m: int) -> tuple[FloatArray, FloatArray]:
+        """Return r_a (pick, outcome, channel) [m] and S_a (..., channel, channel) [m2]."""
+        places, tables = self._places, self.prepared.tables
+        (factor, noise), at = places.variance.T[..., None, None, None], places.place
+        scale = factor * tables.scatter[at, m] + tables.extra[places.normal, at, m]
+        return tables.residual[places.normal, at, m], scale + noise * np.eye(scale.shape[-1])
 
 
 LEFT_OUT = 1e-2
@@ -296,23 +292,14 @@ def narrowed(
     moment = np.arange(share.shape[1])[None, :, None]
     some, r = run[:, None, None], picks.row_of(rows.columns)[:, None, None]
     G = rows.columns[some, r, moment, rows.usual[kept]]
-    unknown = components.unknown
-    theta = [_some(components.theta(run, n), unknown) for n in range(components.normals)]
-    own, G_u = G[:, :, 0], G[..., unknown]
     index = some, picks.row_of(rows.outcomes.residual)[:, None, None], moment, kept
-    outcomes = rows.outcomes
+    outcomes = Outcomes(*(x[index] for x in rows.outcomes.arrays))
     log_weight = rows.log_weight[some, row[:, None, None], moment, kept]
     own_count = np.arange(kept.shape[-1]) < count[..., None]  # whatever its neighbours need
-    return _prepared(
-        place,
-        place,
-        (outcomes.residual[index], outcomes.scatter[index], outcomes.beside[index]),
-        [_apart(G_u - G_u[:, :, :1], *one) for one in theta],
-        (own, G_u[:, :, 0]),
-        theta,
-        np.where(own_count, log_weight, -np.inf),
-        kept,
-    )
+    log_weight = np.where(own_count, log_weight, -np.inf)
+    every, normals = np.arange(kept.shape[-1]), range(components.normals)
+    tables = _tables(outcomes, log_weight, G, every, components, run, normals)
+    return Prepared(tables, place, place, G[:, :, 0], kept)
 
 
 def _kept(scene: Scene, rows: Rows, picks: Picks) -> FloatArray:

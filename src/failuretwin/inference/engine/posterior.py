@@ -19,7 +19,6 @@ from failuretwin.core.numerics import Weighted, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.engine import symmetric
 from failuretwin.inference.engine.picks import Part, Picks
 from failuretwin.inference.engine.runs import RunsEvidence, Weighed
 from failuretwin.inference.faults.marginal import Estimate, MarginalLikelihood
@@ -234,7 +233,7 @@ def theta_of_picks(
         weight: Probability of all of its picks, (pick,).
     """
     one = evidence.weighed[h]
-    picks, found = one.picks[places], one.found[places]
+    picks, found = one.picks[places], one.found.some(places)
     mean, covariance = theta_given(evidence.part(h, picks), *found.sites)
     return ThetaPart(h, places, picks, weight[places], mean, covariance)
 
@@ -281,7 +280,7 @@ def theta_factors(evidence: RunsEvidence) -> tuple[FloatArray, FloatArray]:
 
 def _factors_of(evidence: RunsEvidence, part: ThetaPart) -> tuple[FloatArray, FloatArray]:
     h, picks = part.hypothesis, part.picks
-    rows, found = evidence.rows[h], evidence.weighed[h].found[part.places]
+    rows, found = evidence.rows[h], evidence.weighed[h].found.some(part.places)
     G = evidence.part(h, picks).columns
     lever = rows.lever[picks.run, picks.row]
     A = np.concatenate([G, lever[..., None]], axis=-1)
@@ -303,16 +302,15 @@ def misfit_of(evidence: RunsEvidence) -> FloatArray:
     """Return the mean squared distance of the moments of each run in scales, (run,)."""
     total = np.zeros(evidence.scene.moments.runs)
     for part in theta_parts(evidence):
-        found = evidence.weighed[part.hypothesis].found[part.places]
+        found = evidence.weighed[part.hypothesis].found.some(part.places)
         ready = evidence.part(part.hypothesis, part.picks)
         usable = evidence.scene.moments.usable[part.picks.run]
         square = np.zeros(usable.shape)
         for m in range(usable.shape[1]):
-            mixture, share = ready.mixture_at(m), found.share[:, m]
-            off = mixture.residual - found.mean[:, m].T[:, None]
-            precision, _ = symmetric.inverse(mixture.scale)
-            distance = symmetric.dot(off, symmetric.times(precision, off))  # (outcome, pick)
-            square[:, m] = np.sum(share.T * distance, axis=0)
+            (residual, scale), share = ready.outcomes_at(m), found.share[:, m]
+            off = residual - found.mean[:, None, m]
+            pull = np.linalg.solve(scale, off[..., None])[..., 0]
+            square[:, m] = np.sum(share * np.sum(off * pull, axis=-1), axis=1)
             square[:, m] += OUTLYING * (1.0 - share.sum(axis=1))
         mean = np.sum(np.where(usable, square, 0.0), axis=1) / np.maximum(usable.sum(axis=1), 1)
         np.add.at(total, part.picks.run, part.weight * mean)
@@ -329,9 +327,9 @@ def theta_given(
         information: W of each moment, (pick, moment, channel, channel).
         shift: b of each moment, (pick, moment, channel).
     """
-    ready = part.filter_rows
-    picks, moments, channels = ready.mean.shape
-    size, K, mean = moments * channels, ready.spread, ready.mean.reshape(ready.covariance.shape[:2])
+    mean, K = part.prior
+    picks, moments, channels = shift.shape
+    size = moments * channels
     W = np.zeros((picks, size, size))
     for m in range(moments):
         at = slice(m * channels, (m + 1) * channels)

@@ -104,7 +104,7 @@ class Scene:
             layout: Places in theta.
             covariance: V by which rows are centred, (theta, theta).
         """
-        noise = Noise(model.settling.tail_dof, model.sensors.dims, model.outlier_log_density)
+        noise = Noise.of(model.settling.tail_dof, model.sensors.dims, model.outlier_log_density)
         pose = model.settle(moments.base, moments.direction, model.none_held)
         motion = Motion(moments.direction, moments.speed, moments.bend)
         G = columns(model, pose, motion, layout)
@@ -152,12 +152,8 @@ def before_onset(rows: Rows, healthy: Outcomes, columns_of: FloatArray) -> Rows:
     def pick(sound: FloatArray, faulty: FloatArray) -> FloatArray:
         return np.where(mask.reshape(*mask.shape, *(1,) * (faulty.ndim - 4)), sound, faulty)
 
-    sound = healthy.with_rows()
-    outcomes = Outcomes(
-        pick(sound.residual, rows.outcomes.residual),
-        pick(sound.scatter, rows.outcomes.scatter),
-        pick(sound.beside, rows.outcomes.beside),
-    )
+    pairs = zip(healthy.with_rows().arrays, rows.outcomes.arrays, strict=True)
+    outcomes = Outcomes(*(pick(*pair) for pair in pairs))
     return replace(
         rows,
         outcomes=outcomes,

@@ -11,7 +11,7 @@ Section: docs/inference.md#runs
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,7 +23,7 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.amount_rows import held_rows, offset_rows
-from failuretwin.inference.engine.filter import RowsPosterior, filter_together
+from failuretwin.inference.engine.filter import RowsPosterior
 from failuretwin.inference.engine.picks import Part, Picks, Prepared, narrowed, prepared
 from failuretwin.inference.engine.redrawn_rows import redrawn_rows
 from failuretwin.inference.engine.rows import Rows, Scene
@@ -73,34 +73,7 @@ class Weighed:
         """Return the same with some of the picks weighed anew."""
         log_evidence, amount = self.log_evidence.copy(), self.amount.copy()
         log_evidence[places], amount[places] = some.log_evidence, some.amount
-        return Weighed(self.picks, log_evidence, self.found.with_rows(places, some.found), amount)
-
-
-CHUNK = 1000
-"""Picks that are weighed at a time."""
-ALIKE = 2.0
-"""Hypotheses are weighed together whose rows have at most so many times as many outcomes."""
-
-
-def _batches(sizes: Sequence[int], outcomes: Sequence[int]) -> Iterator[list[tuple[int, slice]]]:
-    """Yield rows of hypotheses to weigh at a time: some of hypothesis and place.
-
-    Args:
-        sizes: How many rows of each hypothesis.
-        outcomes: How many outcomes these have.
-    """
-    batch, count, least = list[tuple[int, slice]](), 0, 0
-    for h in sorted(range(len(sizes)), key=lambda h: outcomes[h]):
-        for at in range(0, max(sizes[h], 1), CHUNK):
-            some = min(CHUNK, sizes[h] - at)
-            if batch and (count + some > CHUNK or outcomes[h] > ALIKE * least):
-                yield batch
-                batch, count = [], 0
-            if not batch:
-                least = outcomes[h]
-            batch.append((h, slice(at, at + some)))
-            count += some
-    yield batch
+        return Weighed(self.picks, log_evidence, self.found.with_picks(places, some.found), amount)
 
 
 def _by_components(picks: Picks, run: IntArray, component: IntArray) -> Picks:
@@ -214,7 +187,9 @@ class RunsEvidence:
         pairs = zip(found, says, strict=True)
         near = [np.flatnonzero(h > best[one.picks.run] - REFINED_NATS) for one, h in pairs]
         some = list(zip(found, near, strict=True))
-        again = self.weigh([one.picks[i] for one, i in some], [one.found[i] for one, i in some])
+        again = self.weigh(
+            [one.picks[i] for one, i in some], [one.found.some(i) for one, i in some]
+        )
         return [one.with_picks(i, new) for (one, i), new in zip(some, again, strict=True)]
 
     @cached_property
@@ -307,18 +282,12 @@ class RunsEvidence:
             before: What the filter has found, to weigh every moment again given all others; None:
                 the filter finds it.
         """
-        outcomes = [one.residual.shape[3] for one in self.prepared]
-        found: list[list[RowsPosterior]] = [[] for _ in picks]
-        for batch in _batches([len(some.run) for some in picks], outcomes):
-            says = filter_together(
-                [self.part(h, picks[h][at]).filter_rows for h, at in batch],
-                None if before is None else [before[h][at] for h, at in batch],
-                [outcomes[h] for h, _ in batch],
-            )
-            for (h, _), one in zip(batch, says, strict=True):
-                found[h].append(one)
-        parts = [RowsPosterior.joined(one) for one in found]
-        return [self._weighed(h, *one) for h, one in enumerate(zip(picks, parts, strict=True))]
+        parts = [self.part(h, some) for h, some in enumerate(picks)]
+        if before is None:
+            found = [one.filtered() for one in parts]
+        else:
+            found = [one.refined(known) for one, known in zip(parts, before, strict=True)]
+        return [self._weighed(h, *one) for h, one in enumerate(zip(picks, found, strict=True))]
 
     def _weighed(self, h: int, picks: Picks, found: RowsPosterior) -> Weighed:
         """Return what rows of a hypothesis say, with the prior of rows and amounts."""
@@ -326,7 +295,7 @@ class RunsEvidence:
         total = found.total + rows.log_prior[picks.run, picks.row]
         if h in self.left_out:
             total = total + self.left_out[h][picks.run]
-        amount = np.stack([found.amount[:, 0], found.amount_spread[:, 0, 0]], axis=1)
+        amount = found.amount.copy()
         if rows.amount_prior is None:
             amount[:, 1] = np.sqrt(np.maximum(amount[:, 1], 0.0))
             amount[:, 0] += rows.centre[picks.run, picks.row]

@@ -55,7 +55,7 @@ def scatter_information(evidence: RunsEvidence, part: ThetaPart) -> ScatterInfor
     model, noise = evidence.scene.model, evidence.scene.noise
     faults = evidence.hypotheses[part.hypothesis].faults
     healthy = ~np.isin(model.motor_names, [fault.motor for fault in faults])
-    found = evidence.weighed[part.hypothesis].found[part.places]
+    found = evidence.weighed[part.hypothesis].found.some(part.places)
     ready = evidence.part(part.hypothesis, part.picks)
     motors = len(healthy)
     zeros = slice(evidence.scene.layout.offsets.start, evidence.scene.layout.offsets.start + motors)
@@ -97,7 +97,7 @@ def _add(
     nu: float,
 ) -> None:
     """Add what one moment says."""
-    (residual, scale), weight = part.mixture_at(m).by_row, found.share[:, m]  # (pick, outcome)
+    (residual, scale), weight = part.outcomes_at(m), found.share[:, m]  # (pick, outcome)
     off = residual - found.mean[:, None, m]
     whitening = np.linalg.inv(np.linalg.cholesky(scale))
     off = np.matmul(whitening, off[..., None])[..., 0]
@@ -166,7 +166,7 @@ def _tail_score(square: FloatArray, nu: float, dims: int) -> tuple[FloatArray, f
 def outcome_shares(evidence: RunsEvidence, part: ThetaPart) -> FloatArray:
     """Return the share of each outcome of each movement, (pick, movement, outcome of all)."""
     moments, rows = evidence.scene.moments, evidence.rows[part.hypothesis]
-    found = evidence.weighed[part.hypothesis].found[part.places]
+    found = evidence.weighed[part.hypothesis].found.some(part.places)
     ready = evidence.part(part.hypothesis, part.picks)
     usual: IntArray = rows.usual[ready.kept]  # (pick, moment, outcome)
     run = part.picks.run

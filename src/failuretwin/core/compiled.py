@@ -1,0 +1,19 @@
+"""Loops over single numbers, compiled to machine code at their first call.
+
+The code is kept beside its module, or in the user's cache folder where that cannot be written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar, cast
+
+import numba
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def compiled(function: Callable[P, T]) -> Callable[P, T]:
+    """Return a function of numbers and arrays as machine code; x / 0 is infinite or NaN."""
+    return cast(Callable[P, T], numba.njit(cache=True, nogil=True, error_model="numpy")(function))
