@@ -44,6 +44,12 @@ from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.on_the_way import (
+    beside,
+    hardly_rest,
+    likeliest_lag,
+    on_the_way,
+)
 from failuretwin.inference.together.life_filter import LifeFilter
 from failuretwin.inference.together.mixed_runs import of_second_robot, two_robots
 from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
@@ -146,7 +152,7 @@ def diagnose_tracked(
     robot = diagnoser.twin.robot
     check_motors(runs, robot.name, robot.motor_names)
     life, known = copy.deepcopy(history.life), set(history.keys)
-    seen = _Seen(runs, diagnoser, Evidence(runs, life.model.settings))
+    seen = _Seen.of(runs, diagnoser, life)
     check_moves(seen.evidence.movements)
     diagnoses: list[Diagnosis | None] = [None] * len(seen.names)
     rows: list[dict[str, Any]] = []
@@ -235,54 +241,65 @@ class _Seen:
         runs: The runs.
         diagnoser: How to diagnose.
         seen: What they say.
+        evidence: Settled positions, and moments on the way of runs that hardly rest.
     """
 
     runs: RunSet
     diagnoser: BayesDiagnoser
     seen: Evidence
+    evidence: SettledEvidence
 
-    @cached_property
-    def evidence(self) -> SettledEvidence:
-        """Settled positions."""
-        return self.seen.sound.settled
+    @classmethod
+    def of(cls, runs: RunSet, diagnoser: BayesDiagnoser, life: LifeFilter) -> _Seen:
+        """Return what runs say; a life learns that it has runs that hardly rest."""
+        seen = Evidence(runs, life.model.settings)
+        evidence = seen.sound.settled
+        if hardly_rest(seen.sound, life.model).any():
+            lag_s = life.lag_s
+            if lag_s is None:
+                lag_s = likeliest_lag(seen.sound, life.model)
+                life.see_moving(lag_s)
+            evidence = on_the_way(seen.sound, life.model, lag_s)
+        return cls(runs, diagnoser, seen, evidence)
 
     @property
     def names(self) -> list[str]:
         """Names of the runs."""
         return [str(name) for name in self.runs["run"].values]
 
-    @property
+    @cached_property
     def keys(self) -> list[str]:
         """Fingerprint of each run; a run that is given twice is known by it."""
-        found = []
+        found, settled = [], self.seen.sound.settled
         for run, name in enumerate(self.names):
-            digest, there = hashlib.sha256(name.encode()), self.evidence.movements.exists[run]
-            for values in (self.evidence.movements.target, self.evidence.point):
+            digest, there = hashlib.sha256(name.encode()), settled.movements.exists[run]
+            for values in (settled.movements.target, settled.point):
                 digest.update(np.ascontiguousarray(values[run][there]).tobytes())
+            if self.evidence.on_the_way[run]:  # no point of it is at rest
+                digest.update(np.ascontiguousarray(self.seen.readings.point[run]).tobytes())
             found.append(digest.hexdigest()[:KEY_DIGITS])
         return found
 
     def diagnose(self, batch: IntArray, life: LifeFilter, cold: bool) -> list[Diagnosis]:
         """Return the diagnosis of some runs by what is believed now, which then learns of them."""
-        life.model = replace(life.model, imperfections=self._known(batch, life, cold))
+        life.model = replace(life.model, imperfections=self._imperfections(batch, life, cold))
         moving = None
-        evidence = self.evidence[batch]
         if not cold and self.diagnoser.uses_transients:
             counts = self.diagnoser.transient_mask(self.evidence.usable)
-            moving = self.seen.sound.transient.where(counts)[batch]
-        posterior = life.follow(evidence, moving)
+            moving = beside(self.seen.sound.transient, self.evidence).where(counts)[batch]
+        posterior = life.follow(self.evidence[batch], moving)
         truth, quality = truths_of(self.runs), self.seen.quality
         return [
             posterior.to_diagnosis(at, self.names[run], quality[run], truth[run])
             for at, run in enumerate(batch.tolist())
         ]
 
-    def _known(self, batch: IntArray, life: LifeFilter, cold: bool) -> Imperfections:
+    def _imperfections(self, batch: IntArray, life: LifeFilter, cold: bool) -> Imperfections:
         """Return what was believed at the beginning, with the timing that the commands tell."""
         now = life.model.imperfections
         if life.arrived > 0 and now.protocol != "P1":
             now = replace(now, name=f"{now.name}, tracked", protocol="P1")
-        if not cold:
+        if not cold or life.lag_s is not None:
             return now
         movements = life.joined_evidence(self.evidence[batch]).movements
         return with_timing_of(now, movements, self.diagnoser.twin.robot)

@@ -104,6 +104,17 @@ class Belief:
         log_weight = log_weight - _log_volume(self.precision, self.shift)
         return Belief(log_weight - log_sum(log_weight, axis=1)[:, None], precision, shift)
 
+    def beside(self, precision: FloatArray) -> Belief:
+        """Return the same of a longer theta, whose last places have mean 0 and are independent.
+
+        Args:
+            precision: Of the places added, (added, added).
+        """
+        old, new = self.precision.shape[-1], len(precision)
+        whole = np.pad(self.precision, [(0, 0), (0, 0), (0, new), (0, new)])
+        whole[..., old:, old:] = precision
+        return Belief(self.log_weight, whole, np.pad(self.shift, [(0, 0), (0, 0), (0, new)]))
+
     def matched(self) -> Normal:
         """Return the normal distribution with the mean and covariance of each mixture."""
         mean, covariance = self.moments

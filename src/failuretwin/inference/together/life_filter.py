@@ -14,12 +14,14 @@ Section: docs/inference.md#lives
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.movements import Stretches
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.engine.registration import (
@@ -91,6 +93,8 @@ class LifeFilter:
         due: Runs at which those of the window are judged again.
         alarm: What changes as no wear does, or empty.
         moved: Whether the sensor was found not to stand where the profile says.
+        lag_s: How far the tool trails its commands in runs that hardly rest [s]; None: there was no
+            such run, and theta has no places for lags.
         alone: What each of the runs followed last says without any belief, in units; it is not
             kept. None before them.
         begun: What was believed of the healthy robot at the beginning.
@@ -110,6 +114,7 @@ class LifeFilter:
     movements: int = 0
     alarm: str = ""
     moved: bool = False
+    lag_s: float | None = None
     alone: Normal | None = None
     begun: Imperfections = field(init=False)
 
@@ -174,10 +179,33 @@ class LifeFilter:
         self.window = self._without_oldest(window)
         return found.weighing.posterior()
 
+    def see_moving(self, lag_s: float) -> None:
+        """Let runs that hardly rest be followed too: lags are in doubt from now on.
+
+        Args:
+            lag_s: How far the tool trails its commands in them [s].
+        """
+        assert self.lag_s is None, "runs that hardly rest are followed already"
+        before, seen = len(self.unit), None if self.window is None else self.window.given.evidence
+        self.lag_s = lag_s
+        believed = robot_components(self.model, self.layout, AS_TOLD)
+        self.unit = np.append(self.unit, believed.usual_deviation[before:])
+        lags = Belief.of(believed, self.unit).precision[0, 0, before:, before:]
+        self.base = self.base.beside(lags)
+        if self.window is not None and seen is not None:
+            window = self._together(_as_stretches(seen))
+            window.sites.precision[:, :before, :before] = self.window.sites.precision
+            window.sites.shift[:, :before] = self.window.sites.shift
+            window.counted[:] = self.window.counted
+            window.told.put(slice(None), self.window.told)
+            window.here[:before] = self.window.here
+            window.maximise()
+            self.window = window
+
     @property
     def layout(self) -> Layout:
         """Places in theta."""
-        return layout_of(self.model.without_doubt)
+        return layout_of(self.model.without_doubt, self.lag_s is not None)
 
     def _state(self, belief: Belief) -> FloatArray:
         """Return mean and deviation of the offsets beside those given, (2, 3 motor)."""
@@ -259,6 +287,7 @@ class LifeFilter:
             "arrived": np.array([self.arrived, self.due, self.moved, self.movements]),
             "alarm": np.array(self.alarm),
             "past": self.past,
+            "lag": np.array(np.nan if self.lag_s is None else self.lag_s),
             **_fields("base", self.base),
             **({} if self.habits is None else _fields("habits", self.habits)),
         }
@@ -286,8 +315,11 @@ class LifeFilter:
         arrived, due, moved, settled = arrays["arrived"].astype(int).tolist()
         base = Belief(*(arrays[f"base/{f.name}"] for f in fields(Belief)))
         habits = None if self.habits is None else _read(Habits, "habits", arrays)
+        began, lag_s = copy.deepcopy(self), float(arrays["lag"])
+        if np.isfinite(lag_s):
+            began.see_moving(lag_s)
         found = replace(
-            self,
+            began,
             base=base,
             habits=habits,
             past=arrays["past"],
@@ -302,6 +334,8 @@ class LifeFilter:
         runs, movements = arrays["window"].astype(int).tolist()
         motors = len(self.model.scatter)
         seen = SettledEvidence.empty(run=runs, movement=movements, motor=motors, axis=3)
+        if found.lag_s is not None:
+            seen = _as_stretches(seen)
         seen.from_arrays("seen", arrays)
         window = found._together(seen)
         window.sites = Normal(arrays["sites/precision"], arrays["sites/shift"])
@@ -315,6 +349,8 @@ class LifeFilter:
 
     def joined_evidence(self, evidence: SettledEvidence) -> SettledEvidence:
         """Return the settled positions of the latest runs with new ones behind them."""
+        if self.lag_s is not None:
+            evidence = _as_stretches(evidence)
         return evidence if self.window is None else self.window.given.evidence.followed_by(evidence)
 
     def _joined(self, evidence: SettledEvidence) -> RunsTogether:
@@ -435,6 +471,10 @@ class LifeFilter:
         of_each = np.maximum(spread / self.unit[free], LEAST_SPREAD)
         precision[loose, loose] = of_each**-2.0
         return Belief(np.zeros((1, 1)), precision[None, None], (precision @ mean)[None, None])
+
+
+def _as_stretches(evidence: SettledEvidence) -> SettledEvidence:
+    return replace(evidence, movements=Stretches.of(evidence.movements))
 
 
 def _state(belief: Belief, unit: FloatArray, layout: Layout) -> FloatArray:
