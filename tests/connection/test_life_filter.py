@@ -201,7 +201,7 @@ def test_wear_is_followed_and_the_doubt_is_honest(armpi):
     assert np.abs(counts).max() < 1.6
     share = np.abs(off / np.maximum(offsets[:, 1, :2], 1e-12))[:, :, 1:]
     assert np.mean(share < 3) > 0.97
-    assert 0.6 < np.mean(share < 1) < 0.92  # two in three, if they were normal
+    assert 0.55 < np.mean(share < 1) < 0.92  # two in three, if they were normal
     assert not any(alarms)
     assert np.ptp(swing, axis=0).max() > 1.5 * COUNT  # it is worth following
 
