@@ -183,7 +183,7 @@ def test_work_goes_on_while_its_store_is_locked(run, file, tmp_path):
     (tmp_path / "task.csv").write_text("x,y,z\n0.15,0.0,0.15\n")
     with closing(sqlite3.connect(file, check_same_thread=False)) as other:
         other.execute("BEGIN IMMEDIATE")
-        release = threading.Timer(8.0, other.rollback)
+        release = threading.Timer(5.0, other.rollback)
         release.start()
         told = run("act", "task.csv", "--store", file, *NAME)
         release.join()
