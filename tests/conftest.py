@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import signal
@@ -28,6 +29,13 @@ settings.load_profile("steady")
 
 SLOW_S = 3600.0
 """Time limit of a test that is marked as slow [s]; that of the others is in pyproject.toml."""
+
+
+def pytest_collection_finish():
+    """Let the garbage collector leave alone what stays: imports are half a million objects."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 100)
 
 
 def pytest_collection_modifyitems(items):

@@ -17,7 +17,7 @@ import executed
 import notebooks
 
 ROOT = Path(__file__).parents[1]
-QUICK = "own_arm"
+QUICK = "diagnose_a_log"
 EACH_TUTORIAL = [
     pytest.param(name, marks=() if name == QUICK else pytest.mark.slow)
     for name in notebooks.TUTORIALS

@@ -34,7 +34,9 @@ WARM = (
         "failuretwin.app.live",
         "failuretwin.decision.test_motions.health_check",
     ),
-    *("dask.array", "matplotlib.backends.backend_agg", "mujoco", "zarr"),
+    *("alembic.command", "dask.array", "distributed", "matplotlib.pyplot", "mujoco"),
+    *("pyarrow.dataset", "pyarrow.parquet", "sqlalchemy.dialects.sqlite", "zarr"),
+    "failuretwin.data_knowledge.records.store",
 )
 LIMIT_S = 120.0
 DISK_BYTES = 500

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warm_command import WarmCommand
+from executed import command_line
 
 FILES = (
     "trajectory_monitoring_cmd.csv",
@@ -17,9 +17,7 @@ FILES = (
 @pytest.fixture(scope="session")
 def failuretwin():
     """Run the command line as a user does, without a terminal."""
-    command = WarmCommand()
-    yield command.run
-    command.close()
+    return command_line().run
 
 
 @pytest.fixture(scope="session")

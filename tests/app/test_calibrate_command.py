@@ -264,7 +264,7 @@ def test_what_was_left_out_is_counted(small):
 # Refusals
 
 
-@pytest.mark.parametrize("label", ["label_5", "label_6", "label_7", "label_8"])
+@pytest.mark.parametrize("label", ["label_5", "label_7"])
 def test_faulty_sessions_are_refused(failuretwin, data, tmp_path, label, listing):
     log = data / "real_robot_b_20241003" / label
     answer = failuretwin(

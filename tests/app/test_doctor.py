@@ -68,8 +68,8 @@ def test_a_log_without_a_verdict_does_not_fit(failuretwin, simulated, tmp_path):
 
 
 def test_calibrate_names_the_set_up_of_logs_that_it_refuses(failuretwin, reversed_log, tmp_path):
-    healthy = load_run_set(reversed_log).isel(run=[0, 0, 0, 0])
-    healthy = healthy.assign_coords(run=[f"healthy/{i}" for i in range(4)])
+    healthy = load_run_set(reversed_log).isel(run=[0, 0])
+    healthy = healthy.assign_coords(run=[f"healthy/{i}" for i in range(2)])
     save_run_set(healthy.drop_vars("position", errors="ignore"), tmp_path / "healthy.nc")
     answer = failuretwin("calibrate", tmp_path / "healthy.nc", "--out", tmp_path / "own.toml")
     assert answer.returncode == 2

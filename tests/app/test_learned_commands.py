@@ -28,6 +28,7 @@ def network(tmp_path_factory):
     path = tmp_path_factory.mktemp("network") / "network.npz"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "TrainingPlan", partial(training.TrainingPlan, validation_runs=18))
+        patch.setattr(training, "CHUNK_RUNS", 96)
         answer = run("train", "--out", path, "--iterations", 4, "--seed", 3)
     return path, answer.output
 

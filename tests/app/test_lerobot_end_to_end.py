@@ -165,10 +165,9 @@ def test_a_guess_is_said_and_one_option_settles_it(failuretwin, tmp_path, health
     assert "joint offsets: none found; 5 of 5 joints follow their commands" in told.stdout
 
 
-@pytest.mark.parametrize("version", [V2, V3])
-def test_episodes_are_diagnosed_alone_and_as_a_life(failuretwin, tmp_path, version):
+def test_episodes_are_diagnosed_alone_and_as_a_life(failuretwin, tmp_path):
     stuck = simulated_counts(4, seed=3, hypothesis="motor_2:stuck")
-    folder = written(tmp_path / "pick", stuck, version=version)
+    folder = written(tmp_path / "pick", stuck)
     told = ("--json", tmp_path / "found.jsonl")
 
     alone = failuretwin("diagnose", folder, "--robot", "so101", *told)

@@ -9,24 +9,34 @@ import pytest
 import failuretwin as ft
 from failuretwin.app.inputs import read_some
 from failuretwin.data_knowledge.readers.read import ReadOptions
+from failuretwin.data_knowledge.store import load_run_set, save_run_set
+
+
+@pytest.fixture(scope="module")
+def three(simulated, tmp_path_factory):
+    """A healthy run and one of each of the first two motors, stuck."""
+    path = tmp_path_factory.mktemp("three") / "runs.nc"
+    save_run_set(load_run_set(simulated).isel(run=slice(3)), path)
+    return path
+
 
 TWO = ("--hypotheses", "healthy,motor_1:stuck", "--calibration", "armpi_fpv")
 
 
-def test_results_are_summed_up_scored_and_remembered(failuretwin, tmp_path, simulated):
+def test_results_are_summed_up_scored_and_remembered(failuretwin, tmp_path, three):
     store = ("--store", tmp_path / "robots.db")
     assert failuretwin("store", "init", *store).returncode == 0
-    words = ("diagnose", simulated, "--parquet", tmp_path / "results", *TWO)
+    words = ("diagnose", three, "--parquet", tmp_path / "results", *TWO)
     answer = failuretwin(*words, *store, "--robot-name", "arm_7")
     assert answer.returncode == 0, answer.stderr
     assert answer.stdout.startswith("most probable")
-    assert f"9 runs diagnosed: {tmp_path / 'results'}" in answer.stdout
-    assert "9 runs of arm_7" in answer.stdout.splitlines()[-1]
-    (scored,) = [line for line in answer.stdout.splitlines() if "of 9 runs right" in line]
+    assert f"3 runs diagnosed: {tmp_path / 'results'}" in answer.stdout
+    assert "3 runs of arm_7" in answer.stdout.splitlines()[-1]
+    (scored,) = [line for line in answer.stdout.splitlines() if "of 3 runs right" in line]
     assert scored in failuretwin("evaluate", tmp_path / "results").stdout
     again = failuretwin(*words)
     assert "holds these results already" in again.stderr
-    assert "9 runs diagnosed" in again.stdout
+    assert "3 runs diagnosed" in again.stdout
 
 
 @pytest.mark.parametrize(
@@ -39,20 +49,17 @@ def test_options_that_need_all_runs_are_refused(failuretwin, tmp_path, simulated
     assert not (tmp_path / "results").exists()
 
 
-def test_priors_that_a_store_teaches_count_as_in_memory(failuretwin, tmp_path, simulated):
+def test_priors_that_a_store_teaches_count_as_in_memory(failuretwin, tmp_path, three):
     store = ("--store", "robots.db", "--robot-name", "arm_7")
     assert failuretwin("store", "init", *store[:2], folder=tmp_path).returncode == 0
-    known = ("diagnose", simulated, *TWO, *store)
-    assert failuretwin(*known, folder=tmp_path).returncode == 0
-    assert (
-        failuretwin("found", "arm_7", 1, "--confirmed", *store[:2], folder=tmp_path).returncode == 0
-    )
-    found = {}
-    for name, more in {"plain": (), "learned": ("--learned-priors",)}.items():
-        told = failuretwin(*known[:-4], *store, *more, "--csv", f"{name}.csv", folder=tmp_path)
+    known = ("diagnose", three, *TWO, *store)
+    confirmed = ("found", "arm_7", 1, "--confirmed", *store[:2])
+    learned = (*known, "--learned-priors")
+    for words in ((*known, "--csv", "plain.csv"), confirmed, (*learned, "--csv", "learned.csv")):
+        told = failuretwin(*words, folder=tmp_path)
         assert told.returncode == 0, told.stderr
-        found[name] = pd.read_csv(tmp_path / f"{name}.csv")
-    told = failuretwin(*known, "--learned-priors", "--parquet", "many", folder=tmp_path)
+    found = {name: pd.read_csv(tmp_path / f"{name}.csv") for name in ("plain", "learned")}
+    told = failuretwin(*learned, "--parquet", "many", folder=tmp_path)
     assert "learned priors: 1 confirmed of 1 robot" in told.stderr
     many = pd.read_parquet(tmp_path / "many")
     chances = [name for name in many.columns if name.startswith("p(")]

@@ -100,7 +100,7 @@ def tracked(runs, tmp_path_factory):
     """The same when each is judged by those before it."""
     folder = tmp_path_factory.mktemp("tracked")
     tables = ("--json", folder / "out.jsonl", "--csv", folder / "out.csv")
-    return diagnose(runs, "--track", *tables), folder
+    return diagnose(runs, "--track", *tables, *AMONG), folder
 
 
 @pytest.mark.parametrize("way", ["together", "tracked"])

@@ -10,7 +10,6 @@ import time
 
 import pytest
 
-from failuretwin.data_knowledge.store import load_run_set
 from waiting import WAIT_S
 
 COMMAND = ("simulate", "--runs-per-class", 30, "--calibration", "armpi_fpv", "--out")
@@ -43,8 +42,8 @@ def test_two_workers_write_the_same_bytes(failuretwin, tmp_path, made_by_one):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_interrupted_work_is_kept_and_continued(failuretwin, tmp_path, workers):
-    arguments = [*COMMAND, tmp_path / "runs.zarr", "--runs-per-class", 60]
+def test_interrupted_work_is_kept_and_continued(failuretwin, tmp_path, made_by_one, workers):
+    arguments = [*COMMAND, tmp_path / "runs.zarr"]
     words = [*arguments, "--workers", workers]
     command = [sys.executable, "-m", "failuretwin", *map(str, words)]
     with subprocess.Popen(
@@ -58,13 +57,13 @@ def test_interrupted_work_is_kept_and_continued(failuretwin, tmp_path, workers):
         os.killpg(process.pid, signal.SIGINT)
         assert process.wait(WAIT_S) == 1
         told, _, rest = remarks(process.stderr.read()).partition("\n")
-    assert "of 540 runs are kept in" in told
+    assert "of 270 runs are kept in" in told
     assert rest.split() == ["interrupted"]
     kept = told.split()[0]
     assert not (tmp_path / "runs.zarr").exists()
     again = failuretwin(*arguments)
-    assert remarks(again.stderr) == f"continuing: {kept} of 540 runs were there\n"
-    assert load_run_set(tmp_path / "runs.zarr").sizes["run"] == 540
+    assert remarks(again.stderr) == f"continuing: {kept} of 270 runs were there\n"
+    assert contents(tmp_path / "runs.zarr") == contents(made_by_one)
     assert [path.name for path in tmp_path.iterdir()] == ["runs.zarr"]
 
 

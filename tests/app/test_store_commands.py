@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sqlite3
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
@@ -44,6 +45,28 @@ def rows(tmp_path):
 
 SAMPLE = ft.sample_log()
 AT = ("--recorded", "2026-03-02T14:30")
+FEW = ("--hypotheses", "healthy,motor_3:stuck")
+
+
+@pytest.fixture(scope="module")
+def told(failuretwin, tmp_path_factory):
+    """A folder with a log, its results and their store; and what was printed."""
+    folder = tmp_path_factory.mktemp("told")
+    (folder / "log.csv").write_bytes(SAMPLE.read_bytes())
+    made = failuretwin("store", "init", "--store", "robots.db", folder=folder)
+    assert made.returncode == 0, made.stderr
+    words = ("diagnose", "log.csv", "--store", "robots.db", *AT, "--robot-name", "arm_7")
+    answer = failuretwin(*words, "--json", "out.jsonl", folder=folder)
+    assert answer.returncode == 0, answer.stderr
+    return folder, answer.stdout
+
+
+@pytest.fixture
+def filled(told, tmp_path):
+    """The same store, to be changed."""
+    for name in ("robots.db", "log.csv", "out.jsonl"):
+        shutil.copy(told[0] / name, tmp_path)
+    return ("--store", "robots.db")
 
 
 def test_a_store_is_made_once_and_checked(run, store, tmp_path):
@@ -54,21 +77,26 @@ def test_a_store_is_made_once_and_checked(run, store, tmp_path):
     assert run("store", "check", *store) == "robots.db: revision 5; empty\nno problems\n"
 
 
-def test_diagnoses_are_remembered_with_their_log(run, store, rows, tmp_path):
-    log = tmp_path / "log.csv"
-    log.write_bytes(SAMPLE.read_bytes())
-    told = run("diagnose", "log.csv", *store, *AT, "--robot-name", "arm_7", "--json", "out.jsonl")
-    assert "remembered in robots.db: 3 runs of arm_7\n" in told
-    assert "episode 2: motor_2 steady_state_error, raised, since 2026-03-02 14:30\n" in told
+def test_diagnoses_are_remembered_with_their_log(run, told, filled, rows, tmp_path):
+    folder, printed = told
+    assert "remembered in robots.db: 3 runs of arm_7\n" in printed
+    assert "episode 2: motor_2 steady_state_error, raised, since 2026-03-02 14:30\n" in printed
     results = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
     names = ("diagnosis", "probability", "onset_s", "magnitude")
     stored = rows("SELECT hypothesis, probability, onset_s, magnitude FROM diagnoses ORDER BY id")
     wanted = [tuple(one[name] for name in names) for one in results]
     assert stored == wanted
-    assert rows("SELECT path, recorded FROM logs") == [(str(log), "2026-03-02 14:30:00.000000")]
-    again = run("diagnose", "log.csv", *store, *AT, "--robot-name", "arm_7")
+    logs = rows("SELECT path, recorded FROM logs")
+    assert logs == [(str(folder / "log.csv"), "2026-03-02 14:30:00.000000")]
+    again = run("diagnose", "log.csv", *filled, *AT, "--robot-name", "arm_7")
     assert "remembered in robots.db: 0 runs of arm_7, 3 known before\n" in again
     assert rows("SELECT count(*) FROM diagnoses") == [(3,)]
+
+
+def test_a_log_that_has_changed_is_a_problem(run, store, tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_bytes(SAMPLE.read_bytes())
+    run("diagnose", "log.csv", *store, *FEW)
     log.write_text("another")
     assert "robots.db: 1 problem. Expected" in run("store", "check", *store, code=2)
 
@@ -77,7 +105,7 @@ def test_each_run_belongs_to_its_log(run, store, rows, tmp_path):
     runs = ft.read_runs(SAMPLE)
     for name, part in (("a.nc", [0, 1]), ("b.nc", [2])):
         save_run_set(runs.isel(run=part), tmp_path / name)
-    run("diagnose", "a.nc", "b.nc", *store)
+    run("diagnose", "a.nc", "b.nc", *store, *FEW)
     found = rows("SELECT path, runs.name FROM runs JOIN logs ON log_id = logs.id ORDER BY runs.id")
     assert [(path.rpartition("/")[2], name) for path, name in found] == [
         ("a.nc", "armpi_fpv/run_1"),
@@ -87,8 +115,8 @@ def test_each_run_belongs_to_its_log(run, store, rows, tmp_path):
     assert rows("SELECT name FROM robots") == [("armpi_fpv",)]
 
 
-def test_a_robot_is_followed_by_what_people_state(run, store, tmp_path):
-    run("diagnose", SAMPLE, *store, *AT, "--robot-name", "arm_7")
+def test_a_robot_is_followed_by_what_people_state(run, filled, tmp_path):
+    store = filled
     stated = run("found", "arm_7", 1, "--confirmed", "--cause", "gear", "--by", "Ada", *store)
     assert stated.endswith("confirmed, since 2026-03-02 14:30\nfinding: confirmed\n")
     run("found", "arm_7", 2, "--cause", "loose cable", *store)
@@ -109,7 +137,7 @@ def test_a_robot_is_followed_by_what_people_state(run, store, tmp_path):
 
 def test_markup_in_names_is_only_text(run, store, tmp_path):
     name = "<b>[red]arm</b>"
-    run("diagnose", SAMPLE, *store, "--robot-name", name)
+    run("diagnose", SAMPLE, *store, "--robot-name", name, *FEW)
     run("found", name, 1, "--confirmed", "--cause", "<script>x</script>", *store)
     assert "<script>x</script>" in run("history", name, *store, "--report", "page")
     page = (tmp_path / "page" / "index.html").read_text("utf-8")
@@ -120,15 +148,15 @@ def test_markup_in_names_is_only_text(run, store, tmp_path):
 def test_the_calibration_of_the_store_is_used_where_none_is_named(
     run, failuretwin, store, rows, simulated, tmp_path
 ):
-    healthy = load_run_set(simulated).isel(run=[0] * 8)
-    names = [f"run_{k}" for k in range(8)]
+    healthy = load_run_set(simulated).isel(run=[0] * 3)
+    names = [f"run_{k}" for k in range(3)]
     save_run_set(healthy.assign_coords(run=names).drop_vars("fault"), tmp_path / "healthy.nc")
     words = ("--robot-name", "arm_7", *store)
     told = run("calibrate", "healthy.nc", "--out", "mine.toml", *words)
     assert "remembered in robots.db: calibration mine of arm_7" in told
     assert rows("SELECT document FROM calibrations") == [((tmp_path / "mine.toml").read_text(),)]
     save_run_set(ft.read_runs(SAMPLE).isel(run=[0]), tmp_path / "log.nc")
-    log = ("log.nc", "--hypotheses", "healthy,motor_3:stuck")
+    log = ("log.nc", *FEW)
     by_store = failuretwin("diagnose", *log, *words, "--csv", "a.csv", folder=tmp_path)
     assert "calibration of arm_7 from the store: mine, valid from" in by_store.stderr
     run("diagnose", *log, "--calibration", "mine.toml", "--csv", "b.csv")
@@ -139,16 +167,20 @@ def test_the_calibration_of_the_store_is_used_where_none_is_named(
     assert rows("SELECT calibration_id FROM sessions ORDER BY id") == [(1,), (None,)]
 
 
-def test_questions_and_exports(run, store, tmp_path):
+def test_questions(run, filled):
     listed = run("query")
     assert listed.splitlines()[0] == "failing-motors          Which motors fail most?"
-    assert run("query", "failing-motors", *store) == "Which motors fail most?\nnone\n"
-    run("diagnose", SAMPLE, *store, *AT)
-    assert "motor_2  steady_state_error  1" in run("query", "failing-motors", *store)
-    assert "open fault" in run("query", "due", "--days", 1, *store)
-    run("store", "export", "--out", "tables", *store)
+    run("store", "init", "--store", "empty.db")
+    empty = run("query", "failing-motors", "--store", "empty.db")
+    assert empty == "Which motors fail most?\nnone\n"
+    assert "motor_2  steady_state_error  1" in run("query", "failing-motors", *filled)
+    assert "open fault" in run("query", "due", "--days", 1, *filled)
+
+
+def test_exports(run, filled, tmp_path):
+    run("store", "export", "--out", "tables", *filled)
     assert len(list((tmp_path / "tables").glob("*.parquet"))) == 16
-    told = run("store", "export", "--aas", "arm.aasx", "--robot-name", "armpi_fpv", *store)
+    told = run("store", "export", "--aas", "arm.aasx", "--robot-name", "arm_7", *filled)
     assert told == "written to arm.aasx: Nameplate, Calibration, Health, FaultHistory\n"
 
 
@@ -186,7 +218,7 @@ def test_a_time_in_the_future_is_refused_and_nothing_is_stored(run, store, rows)
 
 
 def test_a_full_disk_is_one_line(failuretwin, store, tmp_path):
-    answer = failuretwin("diagnose", SAMPLE, *store, folder=tmp_path, disk_full=True)
+    answer = failuretwin("diagnose", SAMPLE, *store, *FEW, folder=tmp_path, disk_full=True)
     assert answer.returncode == 2
     assert "robots.db: the disk is full" in answer.stderr.splitlines()[-1]
     assert failuretwin("store", "check", *store, folder=tmp_path).returncode == 0
@@ -194,12 +226,12 @@ def test_a_full_disk_is_one_line(failuretwin, store, tmp_path):
 
 def test_the_store_of_the_environment_is_used(run, store, monkeypatch):
     monkeypatch.setenv("FAILURETWIN_STORE", "robots.db")
-    assert "remembered in robots.db: 3 runs of armpi_fpv" in run("diagnose", SAMPLE, *AT)
+    assert "remembered in robots.db: 3 runs of armpi_fpv" in run("diagnose", SAMPLE, *AT, *FEW)
     assert run("history", "armpi_fpv").startswith("armpi_fpv: motor_3: stuck, raised")
 
 
 def test_a_store_on_a_server_works_alike(run, postgres):
     url = postgres.place().url
     run("store", "init", "--store", url)
-    run("diagnose", SAMPLE, *AT, "--store", url)
+    run("diagnose", SAMPLE, *AT, "--store", url, *FEW)
     assert run("history", "armpi_fpv", "--store", url).startswith("armpi_fpv: motor_3: stuck")

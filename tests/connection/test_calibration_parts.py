@@ -299,10 +299,10 @@ def test_a_motor_that_hardly_had_to_move_lost_nothing(armpi):
 
 @pytest.mark.parametrize(("readings", "shares"), [(True, 1.0), (False, 1.6)])
 def test_settling_of_a_known_robot_comes_back(settle, armpi, readings, shares):
-    seen = settle(TYPICAL, seed=2, movements=600, readings=readings)
+    seen = settle(TYPICAL, seed=2, movements=300, readings=readings)
     found = fit_settling(seen).settling
     # Four standard errors of a mean, and of a slope over the loads that the movements meet.
-    error = 4.0 * shares * np.asarray(TYPICAL.scatter) * np.sqrt(5.0 / 3.0) / np.sqrt(600)
+    error = 4.0 * shares * np.asarray(TYPICAL.scatter) * np.sqrt(5.0 / 3.0) / np.sqrt(300)
     load = np.std(armpi.loads.torque(seen.target * armpi.sense, 0.0), axis=0)[1:]
     assert np.all(np.abs(np.subtract(found.bias, TYPICAL.bias)) < error)
     assert np.all(np.abs(np.subtract(found.friction, TYPICAL.friction)) < error)

@@ -128,7 +128,8 @@ def test_a_file_holds_what_was_learned(own, armpi, tmp_path):
     np.testing.assert_allclose(rates[0], rates[1], rtol=1e-5)
     assert read_calibration(path, armpi).remarks == found.remarks
     ours, theirs = (
-        BayesDiagnoser(armpi, known).diagnose(runs) for known in (found.calibration, path)
+        BayesDiagnoser(armpi, known, hypotheses=SOME).diagnose(runs)
+        for known in (found.calibration, path)
     )
     for one, other in zip(ours, theirs, strict=True):
         assert one.posterior == pytest.approx(other.posterior, abs=1e-4)
@@ -166,7 +167,9 @@ def test_a_constant_error_in_every_run_is_not_swallowed(armpi, motor, size):
     What a bias of the first motor and a turn of the sensor explain alike is told as either.
     """
     bias = tuple(size * (np.arange(4) == motor - 1))
-    found = learned(armpi, made(armpi, ["healthy"], 8, 2, bias=bias))
+    among = [*SOME, f"motor_{motor}:steady_state_error", f"motor_{motor}:stuck"]
+    runs = made(armpi, ["healthy"], 8, 2, bias=bias)
+    found = learned(armpi, runs, hypotheses=list(dict.fromkeys(among)))
     faulty = [d.diagnosis.startswith(f"motor_{motor}:") for d in found.diagnoses]
     odd = [line for line in found.remarks if f"bias of motor_{motor}: +" in line]
     frame = [line for line in found.remarks if "the sensor does not seem to stand" in line]
@@ -195,7 +198,8 @@ def test_a_zero_far_off_is_told_however_little_the_runs_narrow_it(armpi):
 
 
 def test_a_robot_like_others_of_its_kind_has_no_such_remark(armpi):
-    found = learned(armpi, made(armpi, ["healthy"], 6, 5, bias=(0.004, -0.006, 0.005, 0.0)))
+    runs = made(armpi, ["healthy"], 6, 5, bias=(0.004, -0.006, 0.005, 0.0))
+    found = learned(armpi, runs, hypotheses=SOME)
     assert len(found.remarks) == 2
     assert all(p.note in ("", NOT_TOLD) for p in found.calibration.parameters)
 

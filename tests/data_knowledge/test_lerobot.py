@@ -1,12 +1,13 @@
 from __future__ import annotations
 
-import subprocess
 import sys
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from failuretwin import DigitalTwin, ReadOptions, diagnose, load_robot, read_runs
+from failuretwin.app.cli import cli
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.readers.lerobot import read_lerobot
 from failuretwin.data_knowledge.readers.lerobot_units import LeRobotAngles
@@ -118,20 +119,18 @@ def test_a_unit_that_nothing_states_is_guessed_by_size_and_said(tmp_path, scale,
     assert runs.attrs["source"].startswith(f"LeRobot v3.0, angles in {unit} (guessed: {why}")
 
 
-def test_the_guessed_map_leads_to_a_verdict(tmp_path):
+def test_the_guessed_map_leads_to_a_verdict(tmp_path, monkeypatch):
     write_v3(tmp_path / "pick", scale=4.0, clip=100.0)
-    command = [sys.executable, "-m", "failuretwin", "diagnose", "pick", "--robot", "so101"]
+    monkeypatch.chdir(tmp_path)
+    command = ["diagnose", "pick", "--robot", "so101"]
     command += ["--columns", "map.toml", "--hypotheses", "healthy,motor_2:stuck"]
 
-    def run():
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    guess, result = (CliRunner().invoke(cli, command) for _ in range(2))
 
-    guess, result = run(), run()
-
-    assert guess.returncode == 2
-    assert "low = [-110.0079, -99.9811, -96.8299, -94.9964, -159.8552]" in guess.stdout
-    assert result.returncode == 0, result.stderr
-    assert "pick/episode_000000" in result.stdout
+    assert isinstance(guess.exception, InputError)
+    assert "low = [-110.0079, -99.9811, -96.8299, -94.9964, -159.8552]" in guess.output
+    assert result.exception is None
+    assert "pick/episode_000000" in result.output
 
 
 def test_a_joint_that_the_data_set_lacks_is_told_with_what_it_has(tmp_path):

@@ -209,7 +209,7 @@ def test_verdicts_say_what_was_found(diagnoses):
         assert "100 %" not in d.verdict
 
 
-@pytest.mark.parametrize("onset_s", [None, 0.49, 3.0])
+@pytest.mark.parametrize("onset_s", [None, 0.49])
 def test_finer_quadrature_changes_no_posterior(monkeypatch, twin, few, onset_s):
     priors = dataclasses.replace(priors_of(twin.robot, None, onset_s), setup=SetupPrior.known())
     diagnoser = BayesDiagnoser(twin, priors=priors)
@@ -242,7 +242,7 @@ def test_a_single_hypothesis_is_certain(twin, few):
 
 
 def test_known_onset_helps_and_is_reported(twin, imperfect, diagnoses):
-    rows = [i for i, d in enumerate(diagnoses) if "stuck" in d.truth][::2]
+    rows = [i for i, d in enumerate(diagnoses) if "stuck" in d.truth][::4]
     runs = imperfect.isel(run=rows)
     found = BayesDiagnoser(twin, priors=priors_of(twin.robot, None, 0.49)).diagnose(runs)
 
@@ -342,8 +342,8 @@ def test_robot_of_which_nothing_is_known_is_judged_with_wide_offsets(armpi, impe
         armpi, profile=dataclasses.replace(armpi.profile, imperfections=None)
     )
     assert load_calibration(None, unknown).imperfections.protocol == "P0"
-    found = BayesDiagnoser(DigitalTwin(unknown)).diagnose(imperfect.isel(run=slice(None, None, 4)))
+    found = BayesDiagnoser(DigitalTwin(unknown)).diagnose(imperfect.isel(run=slice(None, None, 8)))
     assert {d.protocol for d in found} == {"P0"}
     assert "not calibrated" in found[0].method
     right = np.mean([d.truth == d.diagnosis for d in found])
-    assert right > 0.85  # reached: 40 of 45
+    assert right > 0.85

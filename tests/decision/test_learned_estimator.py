@@ -180,9 +180,10 @@ def test_fresh_runs_come_from_other_processes_in_order(
         assert set(classes) == {0, 1}
 
 
-def test_learning_from_a_stream_is_repeatable(stream, encoder, runs):
+def test_learning_from_a_stream_is_repeatable(stream, encoder, runs, monkeypatch):
+    monkeypatch.setattr(stream_module, "CHUNK_RUNS", 64)
     names = [str(h) for h in stream.data.hypotheses]
-    chunk = stream.data.chunk(0, CHUNK_RUNS, encoder)
+    chunk = stream.data.chunk(0, 64, encoder)
 
     def learn():
         diagnoser = LearnedDiagnoser("cnn", encoder, iterations=5, random_state=1)

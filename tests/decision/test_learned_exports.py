@@ -54,7 +54,10 @@ def test_a_stored_network_answers_the_same(armpi, trained, runs, network, tmp_pa
     assert first == second
 
 
-@ALL
+@pytest.mark.parametrize(
+    "network",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name == "lstm")) for name in NETWORKS],
+)
 def test_onnx_runtime_agrees(trained, runs, network, tmp_path):
     pytest.importorskip("onnxscript")
     path = tmp_path / "network.onnx"

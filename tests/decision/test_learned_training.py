@@ -8,6 +8,7 @@ from failuretwin.app.commands.learn import train as command
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.decision import training as stream_module
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.decision.learned.networks import (
@@ -166,7 +167,8 @@ def test_widened_robots_differ_more(armpi):
     assert widened(wide, 1.0) == wide
 
 
-def test_a_network_is_trained_and_pooled_with_bayes_in_one_call(armpi, measured_armpi):
+def test_a_network_is_trained_and_pooled_with_bayes_in_one_call(armpi, measured_armpi, monkeypatch):
+    monkeypatch.setattr(stream_module, "CHUNK_RUNS", 64)
     plan = TrainingPlan(iterations=2, validation_runs=18)
     both = train(armpi, measured_armpi, plan, with_bayes=True)
     assert isinstance(both, HybridDiagnoser)

@@ -87,7 +87,8 @@ def test_runs_of_forty_movements_are_diagnosed(armpi, twin):
     known = load_calibration(None, armpi).imperfections
     faults = paper_hypotheses(armpi.motor_names)[::4]
     runs = simulate(Plan(armpi, faults, 1, 3, known, RandomMovements(count=40)))
-    found = BayesDiagnoser(twin, known, paper_hypotheses(armpi.motor_names)[::2]).diagnose(runs)
+    some, priors = paper_hypotheses(armpi.motor_names)[::2], Priors(setup=SetupPrior.known())
+    found = BayesDiagnoser(twin, known, some, priors).diagnose(runs)
     check(found)
     assert [d.diagnosis for d in found] == [d.truth for d in found]
     assert all(d.posterior[d.truth] > (0.85 if d.truth == "healthy" else 0.999) for d in found)

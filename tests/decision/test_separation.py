@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from failuretwin import BayesDiagnoser, SetupPrior
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
 from failuretwin.data_knowledge.generate import Plan, simulate
@@ -41,10 +42,12 @@ def test_the_truth_is_nearest_to_itself(found):
     np.testing.assert_array_equal(found.nearest, others.min(axis=1))
 
 
-def test_runs_that_are_far_ahead_are_diagnosed_right(found, diagnoses):
-    ahead = found.nearest >= 5.0
+def test_runs_that_are_far_ahead_are_diagnosed_right(twin, imperfect, found):
+    ahead = found.nearest[::2] >= 5.0
+    diagnoser = BayesDiagnoser(twin, priors=Priors(setup=SetupPrior.known()))
+    diagnoses = diagnoser.diagnose(imperfect.isel(run=slice(None, None, 2)))
     right = np.array([d.truth == d.diagnosis for d in diagnoses])
-    assert ahead.sum() >= 130
+    assert ahead.sum() >= 65
     assert right[ahead].mean() >= 0.97
     assert right[~ahead].mean() <= right[ahead].mean() - 0.05
 
@@ -115,7 +118,7 @@ def test_a_law_puts_the_tool_where_the_simulator_does(twin, armpi, measured_armp
 
 def test_without_losses_scatter_alone_counts(twin, armpi, imperfect):
     known = load_calibration(None, armpi).imperfections
-    stuck = imperfect.isel(run=range(20, 100))
+    stuck = imperfect.isel(run=range(20, 100, 2))
     lossy = expected_log_bayes_factors(twin, stuck).nats[:, 0]
     sound = expected_log_bayes_factors(
         twin, stuck, dataclasses.replace(known, lost_commands=())
@@ -125,15 +128,14 @@ def test_without_losses_scatter_alone_counts(twin, armpi, imperfect):
     assert sound.mean() > 1.1 * lossy.mean()
 
 
-def test_a_truth_that_is_not_among_the_hypotheses_has_a_nearest_too(twin, imperfect):
+def test_a_truth_that_is_not_among_the_hypotheses_has_a_nearest_too(twin, imperfect, found):
     two = [HEALTHY, Hypothesis.parse("motor_2:stuck")]
-    found = expected_log_bayes_factors(twin, imperfect, hypotheses=["healthy", "motor_2:stuck"])
-    assert found.hypotheses == tuple(two)
-    assert found.nats.shape == (180, 2)
-    whole = expected_log_bayes_factors(twin, imperfect)
-    np.testing.assert_allclose(found.nats, whole.nats[:, [0, 2]], rtol=0, atol=1e-9)
-    strange = [truth not in two for truth in found.truth]
-    np.testing.assert_array_equal(found.nearest[strange], found.nats[strange].min(axis=1))
+    of_two = expected_log_bayes_factors(twin, imperfect, hypotheses=["healthy", "motor_2:stuck"])
+    assert of_two.hypotheses == tuple(two)
+    assert of_two.nats.shape == (180, 2)
+    np.testing.assert_allclose(of_two.nats, found.nats[:, [0, 2]], rtol=0, atol=1e-9)
+    strange = [truth not in two for truth in of_two.truth]
+    np.testing.assert_array_equal(of_two.nearest[strange], of_two.nats[strange].min(axis=1))
 
 
 def test_wrong_runs_are_refused(twin, armpi, imperfect):

@@ -155,7 +155,7 @@ def test_a_log_that_fits_is_judged_as_if_no_set_up_was_asked(twin, runs, as_told
 
 @pytest.mark.parametrize(
     "words",
-    ["motor 2 and motor 3 are swapped", "y of the tool", "millimetres", "degrees"],
+    ["motor 2 and motor 3 are swapped", "y of the tool", "millimetres"],
 )
 def test_a_mistake_is_named_and_the_diagnosis_goes_on(twin, runs, as_told, words):
     found = BayesDiagnoser(twin).diagnose(made(twin.robot, words).runs(runs.isel(run=[1])))
@@ -189,7 +189,7 @@ def test_a_clock_that_is_apart_is_named_with_its_sign(twin, runs, as_told, late_
     same_verdicts(found, as_told)
 
 
-@pytest.mark.parametrize(("late_s", "told"), [(0.14, 0), (0.4, 3), (-0.2, 3)])
+@pytest.mark.parametrize(("late_s", "told"), [(0.14, 0), (0.4, 3)])
 def test_an_arm_that_nobody_has_calibrated_may_trail_its_commands(late_s, told):
     """By how much is not known, so a clock that is a little behind is not blamed for it."""
     robot = load_robot("ur5e")
@@ -248,8 +248,7 @@ def test_a_zero_far_off_what_such_robots_do_is_told_of_one_run(twin, armpi, know
     assert ("zero mark" in state.step) == (off_rad > 0.0)
 
 
-@pytest.mark.parametrize("motor", [0, 1, 2, 3])
-@pytest.mark.parametrize("off_deg", [3.0, -10.0])
+@pytest.mark.parametrize(("motor", "off_deg"), [(0, 3.0), (1, -10.0), (2, 3.0), (3, -10.0)])
 def test_of_one_run_a_zero_is_never_surely_a_motor(armpi, known, motor, off_deg):
     """A fault of every movement and a zero show the same: the prior alone tells them apart."""
     run = simulate(Plan(armpi, ["healthy"], 1, 11 + motor, known, RandomMovements(count=5)))
@@ -260,9 +259,9 @@ def test_of_one_run_a_zero_is_never_surely_a_motor(armpi, known, motor, off_deg)
     assert size < 0.6 or any(f"motor {motor + 1} stands" in line for line in found.quality)
 
 
-@pytest.mark.parametrize("truth", ["motor_1:stuck", "motor_2:steady_state_error"])
-def test_of_one_run_a_fault_does_not_hide_a_zero(armpi, known, truth):
+def test_of_one_run_a_fault_does_not_hide_a_zero(armpi, known):
     """From the fault on no single motor explains the movements."""
+    truth = "motor_1:stuck"
     run = simulate(Plan(armpi, [truth], 1, 5, known, RandomMovements(count=5)))
     wrong = replace(NONE, z=np.deg2rad(8.0) * I4[2]).runs(run)
     (found,) = BayesDiagnoser("armpi_fpv").diagnose(wrong)

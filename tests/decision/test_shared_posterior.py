@@ -115,7 +115,7 @@ def test_where_no_hypothesis_has_a_score_all_is_taken_as_told(twin, runs, in_dou
         pytest.param({"shift": SHIFT}, KNOWN, marks=pytest.mark.slow),
         ({"shift": (0.01, 0.015, -0.01)}, DOUBTED),
         ({"turn_deg": (0.0, 2.0, 0.0)}, DOUBTED),
-        ({"scale": 1.03}, KNOWN),
+        pytest.param({"scale": 1.03}, KNOWN, marks=pytest.mark.slow),
     ],
 )
 def test_verdicts_stand_and_the_set_up_is_told(twin, runs, off, imperfections):

@@ -116,7 +116,8 @@ def test_modes_without_a_law_are_unknown(twin, armpi, monkeypatch):
 def test_known_faults_stay_known(twin, either, imperfect, every):
     """Offering `unknown` turns hardly any right diagnosis: 1.7 % of 900 (docs/inference.md)."""
     some = imperfect.isel(run=slice(None, None, every))
-    right = [d.diagnosis == d.truth for d in BayesDiagnoser(twin).diagnose(some)]
+    without = BayesDiagnoser(twin, priors=KNOWN_SET_UP).diagnose(some)
+    right = [d.diagnosis == d.truth for d in without]
     found = either.diagnose(some.isel(run=np.flatnonzero(right)))
     assert np.mean([d.diagnosis == d.truth for d in found]) >= 0.95
 
@@ -176,5 +177,5 @@ def test_what_is_named_is_not_taken_for_unknown(twin, measured_armpi, name, coun
     truth = Hypothesis.parse(name)
     runs = simulate(Plan(twin.robot, [truth], count, 13, measured_armpi))
     offered = [HEALTHY, truth, Hypothesis.parse("motor_1:stuck"), UNKNOWN]
-    found = BayesDiagnoser(twin, measured_armpi, offered).diagnose(runs)
+    found = BayesDiagnoser(twin, measured_armpi, offered, KNOWN_SET_UP).diagnose(runs)
     assert sum(d.diagnosis == name for d in found) >= least

@@ -5,6 +5,8 @@ The healthy halves of the 90 runs also calibrated the twin, so their figures are
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -28,12 +30,13 @@ def real(data):
 
 @pytest.fixture(scope="module")
 def told(real, twin):
-    """Diagnoses of the 90 runs, by form and whether the whole run counts."""
-    return {
-        (how, whole): ft.BayesDiagnoser(twin, whole_run=whole).diagnose(runs)
-        for how, runs in real.items()
-        for whole in (True, False)
-    }
+    """Return diagnoses of the 90 runs by form and whether the whole run counts, once asked for."""
+
+    @cache
+    def diagnoses(how, whole):
+        return ft.BayesDiagnoser(twin, whole_run=whole).diagnose(real[how])
+
+    return diagnoses
 
 
 def surprise(posteriors, truths):
@@ -46,13 +49,13 @@ def surprise(posteriors, truths):
     ("how", "whole", "right", "score"),
     [
         ("measured", True, 90, 0.025401),
-        ("measured", False, 90, 0.028402),
+        pytest.param("measured", False, 90, 0.028402, marks=pytest.mark.slow),
         ("published", True, 86, 0.114331),
-        ("published", False, 85, 0.123215),
+        pytest.param("published", False, 85, 0.123215, marks=pytest.mark.slow),
     ],
 )
 def test_ninety_runs_with_the_bundled_calibration(told, how, whole, right, score):
-    diagnoses = told[how, whole]
+    diagnoses = told(how, whole)
     assert len(diagnoses) == 90
     assert sum(d.truth == d.diagnosis for d in diagnoses) == right
     reached = surprise([d.posterior for d in diagnoses], [d.truth for d in diagnoses])
@@ -64,7 +67,7 @@ def test_intervals_of_stuck_motors_hold_as_many_as_they_did(real, told, how, ang
     """Of 40, give or take one; intervals of 90 % that are too wide hold too many."""
     truth = real[how][["magnitude", "onset"]].to_dataarray().values
     held, begun = [], []
-    for i, d in enumerate(told[how, True]):
+    for i, d in enumerate(told(how, True)):
         if d.truth == d.diagnosis and "stuck" in d.truth:
             held.append(d.magnitude_90[0] <= truth[0, i] <= d.magnitude_90[1])
             begun.append(d.onset_90[0] <= truth[1, i] <= d.onset_90[1])
@@ -78,7 +81,7 @@ def test_angle_of_frozen_motors_is_found(real, told, how):
     truth = real[how]["magnitude"].values
     errors = [
         abs(d.magnitude - truth[i])
-        for i, d in enumerate(told[how, True])
+        for i, d in enumerate(told(how, True))
         if d.truth == d.diagnosis and "stuck" in d.truth
     ]
     assert len(errors) >= 30
@@ -88,10 +91,11 @@ def test_angle_of_frozen_motors_is_found(real, told, how):
 @pytest.mark.parametrize(("how", "most"), [("measured", 1), ("published", 2)])
 def test_false_alarms_in_ten_healthy_runs(told, how, most):
     """Gaps drawn out by straight lines can look like a motor that stops."""
-    healthy = [d for d in told[how, True] if d.truth == "healthy"]
+    healthy = [d for d in told(how, True) if d.truth == "healthy"]
     assert sum(d.diagnosis != "healthy" for d in healthy) <= most
 
 
+@pytest.mark.slow
 def test_at_least_84_of_90_with_a_known_error_range(real, twin):
     priors = priors_of(twin.robot, (4, 21), None)
     diagnoses = ft.BayesDiagnoser(twin, priors=priors).diagnose(real["published"])

@@ -11,9 +11,10 @@ from failuretwin.core.hypothesis import CLEAR, RAISED
 from failuretwin.core.runs import run_set
 from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
 from failuretwin.decision.streaming.fleet import StreamingFleet
-from failuretwin.decision.streaming.monitor import monitor
+from failuretwin.decision.streaming.monitor import FaultMonitor, monitor
 
 OFF = np.deg2rad(3.0)
+FEW = ["healthy", "motor_3:steady_state_error", "motor_4:steady_state_error"]
 
 
 @pytest.fixture
@@ -44,7 +45,8 @@ def test_an_error_of_the_last_motor_shows_sooner(twin, reported):
     """The tool hardly shows motor 4; its own reading does."""
     samples, raised = reported(24, error_from=12), {}
     for sensing in ("tool", "tool+encoders"):
-        watch = monitor(twin, sensing=sensing)
+        diagnoser = BayesDiagnoser(twin, hypotheses=FEW, whole_run=False, sensing=sensing)
+        watch = FaultMonitor(diagnoser)
         told = [watch.update(*sample) for sample in samples]
         at = next(answer for answer in told if answer.alarm.state == RAISED)
         raised[sensing] = at.time

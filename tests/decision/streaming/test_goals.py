@@ -10,10 +10,16 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import CLEAR, RAISED
 from failuretwin.core.runs import run_set
 from failuretwin.decision.streaming.fleet import StreamingFleet
-from failuretwin.decision.streaming.monitor import monitor
+from failuretwin.decision.streaming.monitor import FaultMonitor, monitor
 
 MOTOR = 0
 """The motor of the ArmPi FPV that loses one command in twenty."""
+FEW = ["healthy", "motor_1:stuck", "motor_1:steady_state_error", "motor_2:stuck"]
+
+
+def watching(twin, sensing):
+    """Return a watch for a few faults, by some sensors."""
+    return FaultMonitor(BayesDiagnoser(twin, hypotheses=FEW, whole_run=False, sensing=sensing))
 
 
 @pytest.fixture
@@ -49,7 +55,7 @@ def test_a_stuck_motor_that_received_its_goal_is_named_within_a_movement(twin, r
     """From the tool alone it may as well have lost its commands."""
     samples, raised = reported(15, stays_from=6), {}
     for sensing in ("tool", "tool+goals"):
-        watch = monitor(twin, sensing=sensing)
+        watch = watching(twin, sensing)
         told = [watch.update(*sample) for sample in samples]
         at = next(answer for answer in told if answer.alarm.state == RAISED)
         assert at.alarm.cause == "motor_1:stuck"
@@ -61,7 +67,7 @@ def test_a_stuck_motor_that_received_its_goal_is_named_within_a_movement(twin, r
 def test_a_motor_whose_goals_do_not_come_is_not_stuck(twin, reported):
     samples, states = reported(15, stays_from=6, lost=True), {}
     for sensing in ("tool", "tool+goals"):
-        watch = monitor(twin, sensing=sensing)
+        watch = watching(twin, sensing)
         told = [watch.update(*sample) for sample in samples]
         states[sensing] = {answer.alarm.state for answer in told}
     assert RAISED in states["tool"]

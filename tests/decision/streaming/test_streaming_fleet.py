@@ -80,7 +80,7 @@ def test_the_end_of_a_stream_is_the_batch(nine_runs, live_diagnoser, played):
 
 def test_robots_do_not_know_each_other(nine_runs, live_diagnoser, played):
     _, together = played
-    for robot in (0, 2, 5):
+    for robot in (0, 5):
         alone = play(nine_runs, live_diagnoser, slice(robot, robot + 1)).posterior
         np.testing.assert_allclose(alone[0], together[robot], rtol=0.0, atol=1e-12)
 
