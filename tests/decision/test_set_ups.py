@@ -285,6 +285,17 @@ def test_two_zeros_or_one_and_a_shift_blame_no_motor(armpi, known, wrong):
         assert any("motor" in line for line in remarks(found))
 
 
+@pytest.mark.parametrize(("off_rad", "sure"), [(0.02, False), (0.06, True)])
+def test_a_zero_as_others_of_the_class_have_it_may_be_another_robot(armpi, known, off_rad, sure):
+    z = off_rad * np.array([0.0, 1.0, 0.0, 0.0])
+    runs = simulate(Plan(armpi, ["healthy"], 8, 3, known, RandomMovements(count=6)))
+    made_so = LogCorrection(I4, -z, np.eye(3), np.zeros(3)).runs(runs)
+    found = BayesDiagnoser(armpi, known, ERRORS).seen(made_so).set_ups()
+    zeros = [one for one in found.found if one.set_up.kind == "zero"]
+    assert any(np.allclose(one.set_up.correction.z, z, atol=0.01) for one in zeros)
+    assert found.wrong > 0.99 if sure else found.wrong < 0.5
+
+
 def test_errors_that_are_drawn_anew_are_no_zero(armpi, known):
     """Nothing is lost of what only a fault does."""
     truth = "motor_3:steady_state_error"

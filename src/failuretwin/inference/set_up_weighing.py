@@ -27,11 +27,12 @@ from failuretwin.inference.engine.registration import (
     evidence_at_once,
 )
 from failuretwin.inference.engine.runs import has_rows
-from failuretwin.inference.engine.theta import offsets_doubted
+from failuretwin.inference.engine.theta import offset_deviation, offsets_doubted
 from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import highest_and_outlier
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.robot_mixture import robot_components
 from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp, with_doubt
 from failuretwin.inference.set_ups.log_correction import LogCorrection
 from failuretwin.inference.set_ups.set_ups import FEWEST_TO_TURN, SetUp, mistakes, turned, zero_off
@@ -168,7 +169,8 @@ class SetUpWeighing:
         if not told[0].fits:
             told = self.weigh([self.as_told], everything=True)
         if told[0].fits and not thorough:
-            return self._believed([*told, *self.zeros(self.as_told, told[0].log_joint)])
+            zeros = self.zeros(self.as_told, told[0].log_joint)
+            return self._believed([*told, *zeros, *self.others(zeros)])
         return self.few.searched()
 
     def _believed(self, weighed: Sequence[WeighedSetUp]) -> SetUpPosterior:
@@ -201,7 +203,7 @@ class SetUpWeighing:
         single = self.options(self.as_told)
         told = self.weigh([self.as_told], everything=True)[0]
         zeros = self.zeros(self.as_told, told.log_joint, ZEROS_RAD)
-        found = [told, *self.weigh(single), *zeros]
+        found = [told, *self.weigh(single), *zeros, *self.others(zeros)]
         likeliest = max(zeros, key=lambda one: one.log_joint, default=None)
         if likeliest is not None:
             found += self.zeros(likeliest.set_up, likeliest.log_joint, ZEROS_RAD)
@@ -276,6 +278,31 @@ class SetUpWeighing:
                 zero = self._zero(first, k, likeliest, width)
                 off = zero.set_up.correction.z[k] - first.correction.z[k]
                 found += [zero] if abs(off) > OFF * width else []
+        return found
+
+    def others(self, zeros: Sequence[WeighedSetUp]) -> list[WeighedSetUp]:
+        """Return other robots than the calibrated one, set up as told, that explain as much.
+
+            p(z) = p(another robot) N(b + z; b_class, deviation of b in its class)
+
+        Args:
+            zeros: Zeros z, each of one motor, whose bias is b in the calibration.
+        """
+        model = self.likelihood.model
+        known = robot_components(model, self.priors)
+        if model.imperfections.of_class or len(known) == 1:
+            return []
+        kind, found = known[1], list[WeighedSetUp]()
+        bias = np.asarray(model.settling.bias) - np.asarray(kind.model.settling.bias)
+        deviation = offset_deviation(kind.model)
+        for zero in zeros:
+            motor = int(np.argmax(np.abs(zero.set_up.correction.z)))
+            off = float(zero.set_up.correction.z[motor])
+            width = float(zero.set_up.log_prior - self._off(self.as_told, motor, off).log_prior)
+            square = ((bias[motor] + off) / deviation[motor]) ** 2
+            says = -0.5 * square - float(np.log(np.sqrt(2.0 * np.pi) * deviation[motor]))
+            log_prior = self.as_told.log_prior + kind.log_weight + says + width
+            found.append(replace(zero, set_up=replace(self.as_told, log_prior=log_prior)))
         return found
 
     def _moved_zeros(self, near: SetUp) -> list[WeighedSetUp]:
