@@ -270,7 +270,7 @@ class SetUpWeighing:
             seen = likelihood.usable & (says.min_distance2[..., 0] < EXPLAINED)
             away = says.turned(says.mode - says.expected)[..., 0]
             agreed = _agreed(away[seen], width, least)
-            values = [z for z in agreed if not _right_in_some(away, seen, z)] + list(also)
+            values = [z for z in agreed if not right_in_some(away, seen, z, width)] + list(also)
             tried = self.weigh([self._off(first, k, value) for value in values])
             log_joint = [one.log_joint for one in tried]
             if max(log_joint, default=-np.inf) > told - HOPELESS_NATS:
@@ -365,7 +365,7 @@ def _agreed(off: FloatArray, width: float, least: float) -> list[float]:
     return values
 
 
-def _right_in_some(away: FloatArray, seen: BoolArray, zero: float) -> bool:
+def right_in_some(away: FloatArray, seen: BoolArray, zero: float, width: float) -> bool:
     """Return whether a motor stands where it should in most movements of some run, not at a zero.
 
     A zero that is wrong is so in every run; what only some have is a fault.
@@ -374,8 +374,9 @@ def _right_in_some(away: FloatArray, seen: BoolArray, zero: float) -> bool:
         away: By how much the motor is off, (run, movement) [rad].
         seen: Which movements tell, (run, movement).
         zero: The zero [rad].
+        width: Deviation of each movement [rad].
     """
-    right = (np.abs(away) < 0.5 * abs(zero)) & seen
+    right = (np.abs(away) < min(0.5 * abs(zero), CLUSTER * width)) & seen
     most = 2 * right.sum(axis=1) > seen.sum(axis=1)
     return bool((most & (right.sum(axis=1) >= RIGHT)).any())
 
