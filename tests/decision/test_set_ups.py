@@ -19,7 +19,7 @@ from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp
-from failuretwin.inference.set_up_weighing import ANOTHER
+from failuretwin.inference.set_up_weighing import ANOTHER, right_in_some
 from failuretwin.inference.set_ups.log_correction import CorrectionTable, LogCorrection
 from failuretwin.inference.set_ups.set_ups import FAULT_OF_EVERY_RUN, SetUp, mistakes, zero_off
 
@@ -282,6 +282,24 @@ def test_two_zeros_or_one_and_a_shift_blame_no_motor(armpi, known, wrong):
     for found in BayesDiagnoser("armpi_fpv", hypotheses=ERRORS).diagnose(wrong.runs(runs)):
         assert found.diagnosis == "healthy" or max(found.posterior.values()) < 0.9
         assert any("motor" in line for line in remarks(found))
+
+
+@pytest.mark.parametrize(("off_deg", "right"), [(0.1, True), (1.6, False), (5.0, False)])
+def test_a_motor_is_right_within_its_deviation_not_within_half_a_zero(off_deg, right):
+    away = np.deg2rad(np.array([[5.0, 5.1, 4.9, 5.0], [10.0, off_deg, -off_deg, off_deg]]))
+    seen = np.ones(away.shape, dtype=bool)
+    assert right_in_some(away, seen, np.deg2rad(5.0), np.deg2rad(0.2)) is right
+
+
+@pytest.mark.parametrize(("off_rad", "sure"), [(0.02, False), (0.06, True)])
+def test_a_zero_as_others_of_the_class_have_it_may_be_another_robot(armpi, known, off_rad, sure):
+    z = off_rad * np.array([0.0, 1.0, 0.0, 0.0])
+    runs = simulate(Plan(armpi, ["healthy"], 8, 3, known, RandomMovements(count=6)))
+    made_so = LogCorrection(I4, -z, np.eye(3), np.zeros(3)).runs(runs)
+    found = BayesDiagnoser(armpi, known, ERRORS).seen(made_so).set_ups()
+    zeros = [one for one in found.found if one.set_up.kind == "zero"]
+    assert any(np.allclose(one.set_up.correction.z, z, atol=0.01) for one in zeros)
+    assert found.wrong > 0.99 if sure else found.wrong < 0.5
 
 
 def test_errors_that_are_drawn_anew_are_no_zero(armpi, known):

@@ -157,6 +157,18 @@ def test_what_else_it_may_be_is_told():
     )
 
 
+@pytest.mark.parametrize(
+    ("nats", "told_so"),
+    [((0.1, 0.2, 6.0), True), ((0.1, 3.0, 3.0), False), ((0.1, 6.0, 0.1), False)],
+)
+def test_a_stop_that_the_last_movement_alone_shows_may_be_a_lost_command(nats, told_so):
+    evidence = tuple(MovementEvidence(m + 1, shown) for m, shown in enumerate(nats))
+    said = told(single("stuck"), 0.99, [(HEALTHY, 0.01)], evidence=evidence)
+    assert said.endswith("a lost command looks the same") is told_so
+    other = told(single("slow"), 0.99, [(HEALTHY, 0.01)], evidence=evidence)
+    assert "lost command" not in other
+
+
 @pytest.mark.parametrize("chances", [(0.96, 0.04), (0.5, 0.44, 0.03, 0.03), (0.2,) * 5, (1.0,)])
 def test_possible_hypotheses_are_the_fewest_that_are_sure(chances):
     names = [HEALTHY, *(single(mode) for mode in SIZED)][: len(chances)]

@@ -133,7 +133,19 @@ def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:
     if len(possible) > 1:
         others = [f"{plain_name(h)} {percent(diagnosis.posterior[str(h)])}" for h in possible[1:3]]
         text += f" (or {', '.join(others)})"
-    return text
+    return f"{text}{LAST_ONLY}" if _shows_last(diagnosis, best) else text
+
+
+LAST_ONLY = "; seen in the last movement only: a lost command looks the same"
+"""Said of a motor that stops in the last movement."""
+
+
+def _shows_last(diagnosis: Diagnosis, best: Hypothesis) -> bool:
+    """Return whether only the last movement says that a motor is stuck."""
+    if [fault.mode for fault in best.faults] != [STUCK] or not rests_on_one_movement(diagnosis):
+        return False
+    most = max(diagnosis.evidence, key=lambda movement: movement.nats)
+    return len(diagnosis.evidence) > 1 and most is diagnosis.evidence[-1]
 
 
 _TOLD_UNITS = {

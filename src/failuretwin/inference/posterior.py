@@ -224,7 +224,7 @@ def abstention_reason(
     if not evidence.movements.exists[run].any():
         return "no motor is told to move"
     if not usable.any():
-        return "the tool is not seen at rest after any movement"
+        return NEVER_AT_REST
     if usable.sum() <= FEW_MOVEMENTS and probability < 0.5:
         count = int(usable.sum())
         return f"only {counted(count, 'movement')} can be used and no hypothesis stands out"
@@ -238,6 +238,11 @@ def abstention_reason(
     return f"after movement {which} {NOWHERE}: {nowhere_near(model.twin, target, point)}"
 
 
+NEVER_AT_REST = (
+    "the tool is not seen at rest after any movement, and on its way it cannot be compared with "
+    "the commands: too few readings, or commands too far apart in time"
+)
+"""Why a run without a usable movement allows no verdict."""
 LEVELS = (0.05, 0.5, 0.95)
 """Quantiles that are told: the ends of a 90 % interval and the median."""
 

@@ -27,11 +27,12 @@ from failuretwin.inference.engine.registration import (
     evidence_at_once,
 )
 from failuretwin.inference.engine.runs import has_rows
-from failuretwin.inference.engine.theta import offsets_doubted
+from failuretwin.inference.engine.theta import offset_deviation, offsets_doubted
 from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import highest_and_outlier
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.robot_mixture import robot_components
 from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp, with_doubt
 from failuretwin.inference.set_ups.log_correction import LogCorrection
 from failuretwin.inference.set_ups.set_ups import FEWEST_TO_TURN, SetUp, mistakes, turned, zero_off
@@ -168,7 +169,8 @@ class SetUpWeighing:
         if not told[0].fits:
             told = self.weigh([self.as_told], everything=True)
         if told[0].fits and not thorough:
-            return self._believed([*told, *self.zeros(self.as_told, told[0].log_joint)])
+            zeros = self.zeros(self.as_told, told[0].log_joint)
+            return self._believed([*told, *zeros, *self.others(zeros)])
         return self.few.searched()
 
     def _believed(self, weighed: Sequence[WeighedSetUp]) -> SetUpPosterior:
@@ -201,7 +203,7 @@ class SetUpWeighing:
         single = self.options(self.as_told)
         told = self.weigh([self.as_told], everything=True)[0]
         zeros = self.zeros(self.as_told, told.log_joint, ZEROS_RAD)
-        found = [told, *self.weigh(single), *zeros]
+        found = [told, *self.weigh(single), *zeros, *self.others(zeros)]
         likeliest = max(zeros, key=lambda one: one.log_joint, default=None)
         if likeliest is not None:
             found += self.zeros(likeliest.set_up, likeliest.log_joint, ZEROS_RAD)
@@ -268,7 +270,7 @@ class SetUpWeighing:
             seen = likelihood.usable & (says.min_distance2[..., 0] < EXPLAINED)
             away = says.turned(says.mode - says.expected)[..., 0]
             agreed = _agreed(away[seen], width, least)
-            values = [z for z in agreed if not _right_in_some(away, seen, z)] + list(also)
+            values = [z for z in agreed if not right_in_some(away, seen, z, width)] + list(also)
             tried = self.weigh([self._off(first, k, value) for value in values])
             log_joint = [one.log_joint for one in tried]
             if max(log_joint, default=-np.inf) > told - HOPELESS_NATS:
@@ -276,6 +278,31 @@ class SetUpWeighing:
                 zero = self._zero(first, k, likeliest, width)
                 off = zero.set_up.correction.z[k] - first.correction.z[k]
                 found += [zero] if abs(off) > OFF * width else []
+        return found
+
+    def others(self, zeros: Sequence[WeighedSetUp]) -> list[WeighedSetUp]:
+        """Return other robots than the calibrated one, set up as told, that explain as much.
+
+            p(z) = p(another robot) N(b + z; b_class, deviation of b in its class)
+
+        Args:
+            zeros: Zeros z, each of one motor, whose bias is b in the calibration.
+        """
+        model = self.likelihood.model
+        known = robot_components(model, self.priors)
+        if model.imperfections.of_class or len(known) == 1:
+            return []
+        kind, found = known[1], list[WeighedSetUp]()
+        bias = np.asarray(model.settling.bias) - np.asarray(kind.model.settling.bias)
+        deviation = offset_deviation(kind.model)
+        for zero in zeros:
+            motor = int(np.argmax(np.abs(zero.set_up.correction.z)))
+            off = float(zero.set_up.correction.z[motor])
+            width = float(zero.set_up.log_prior - self._off(self.as_told, motor, off).log_prior)
+            square = ((bias[motor] + off) / deviation[motor]) ** 2
+            says = -0.5 * square - float(np.log(np.sqrt(2.0 * np.pi) * deviation[motor]))
+            log_prior = self.as_told.log_prior + kind.log_weight + says + width
+            found.append(replace(zero, set_up=replace(self.as_told, log_prior=log_prior)))
         return found
 
     def _moved_zeros(self, near: SetUp) -> list[WeighedSetUp]:
@@ -338,7 +365,7 @@ def _agreed(off: FloatArray, width: float, least: float) -> list[float]:
     return values
 
 
-def _right_in_some(away: FloatArray, seen: BoolArray, zero: float) -> bool:
+def right_in_some(away: FloatArray, seen: BoolArray, zero: float, width: float) -> bool:
     """Return whether a motor stands where it should in most movements of some run, not at a zero.
 
     A zero that is wrong is so in every run; what only some have is a fault.
@@ -347,8 +374,9 @@ def _right_in_some(away: FloatArray, seen: BoolArray, zero: float) -> bool:
         away: By how much the motor is off, (run, movement) [rad].
         seen: Which movements tell, (run, movement).
         zero: The zero [rad].
+        width: Deviation of each movement [rad].
     """
-    right = (np.abs(away) < 0.5 * abs(zero)) & seen
+    right = (np.abs(away) < min(0.5 * abs(zero), CLUSTER * width)) & seen
     most = 2 * right.sum(axis=1) > seen.sum(axis=1)
     return bool((most & (right.sum(axis=1) >= RIGHT)).any())
 

@@ -107,6 +107,33 @@ def test_points_of_an_arm_without_lag_are_those_of_the_command():
         assert np.abs(seen.point[0] - expected)[seen.usable[0]].max() < rounded
 
 
+def once_a_second(command):
+    """The command as a log has it that states it once a second, joined by lines."""
+    time = STEP_S * np.arange(len(command))
+    at = time[::100]
+    return np.stack([np.interp(time, at, one[::100]) for one in command.T], axis=-1)
+
+
+def test_a_curve_that_is_told_once_a_second_cannot_be_judged_on_its_way():
+    healthy = model()
+    followed = exact_run(curve(), healthy.lag_s)
+    _, seen = moments(followed)
+    assert seen.usable.any()
+    told = once_a_second(curve())[None]
+    _, seen = moments(followed.assign(command=(followed["command"].dims, told)))
+    assert not seen.usable.any()
+
+
+@pytest.mark.parametrize("fault", ["stuck", "off"])
+def test_a_faulty_motor_on_straight_ramps_is_judged_on_its_way(fault):
+    healthy, command = model(), zigzag()
+    moved = command.copy()
+    moved[:, 1] = command[150, 1] if fault == "stuck" else command[:, 1] + 0.1
+    run = exact_run(moved, healthy.lag_s)
+    _, seen = moments(run.assign(command=(run["command"].dims, command[None])))
+    assert seen.usable.all()
+
+
 def test_a_curve_has_a_moment_every_second_and_loses_no_command():
     healthy, seen = moments(exact_run(curve(), 0.0))
     assert seen.usable.sum() == 8

@@ -21,6 +21,7 @@ import numpy as np
 
 from failuretwin.core.movements import Stretches
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
+from failuretwin.inference.observation.between_commands import strays_between
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.lag_offset import command_at, lag_offset
@@ -89,6 +90,8 @@ def likeliest_lag(evidence: Evidence, model: HealthyModel) -> float:
 def on_the_way(evidence: Evidence, model: HealthyModel, lag_s: float) -> SettledEvidence:
     """Return settled positions, and moments on the way of runs that hardly rest.
 
+    None of runs whose tool leaves the straight way between commands.
+
     Args:
         evidence: What the runs say.
         model: The healthy robot: how early its ramps end.
@@ -96,6 +99,7 @@ def on_the_way(evidence: Evidence, model: HealthyModel, lag_s: float) -> Settled
     """
     settled = evidence.settled
     hardly = hardly_rest(evidence, model)
+    hardly &= ~strays_between(evidence, model, hardly, lag_s)
     unseen = settled.movements.exists & ~settled.usable & hardly[:, None]
     if not model.sensors.tool_alone or not unseen.any():
         return settled
