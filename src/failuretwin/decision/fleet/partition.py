@@ -24,7 +24,7 @@ from failuretwin.connection.fleet.messages import (
 from failuretwin.connection.fleet.robot_input import RobotInput, Sample
 from failuretwin.core.config import fingerprint, from_table
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import ALL_CLEAR, RAISED, Alarm
+from failuretwin.core.hypothesis import ALL_CLEAR, RAISED, Alarm, Episode
 from failuretwin.decision.fleet.monitor import FleetMonitor
 from failuretwin.inference.diagnoser import BayesDiagnoser
 
@@ -35,8 +35,9 @@ FIRST_ROOM = 8
 PROFILE, EVENTS = "profile", "events"
 """Kinds of messages; the last part of their subjects."""
 CLEARED = "cleared"
-MALFORMED, UNKNOWN = "malformed", "no_profile"
-"""What is counted: messages that make no sense, and those of robots without a profile."""
+MALFORMED, UNKNOWN, REFUSED = "malformed", "no_profile", "refused"
+"""What is counted: messages that make no sense, those of robots without a profile, and those of
+robots that are refused."""
 
 Resolve = Callable[[ProfileMessage], BayesDiagnoser]
 """Returns the method for robots with a profile; raises InputError where there is none."""
@@ -75,7 +76,7 @@ class AlarmChange:
         at: When the server took in the message that decided it [s since 1970].
         stream_s: When it was by the stream of the robot [s].
         message: Number of that message.
-        diagnosis: The diagnosis behind it, as a table; empty: none.
+        diagnosis: The diagnosis behind it, as a table.
     """
 
     robot: str
@@ -170,6 +171,8 @@ class Partition:
     Attributes:
         counts: Messages that were left out, by reason.
         last: Number of the last message that was taken; 0: none.
+        announced: Profiles, by robot.
+        refused: Robots whose messages break the filter: they are counted and left out.
 
     Args:
         resolve: Finds the method for a profile.
@@ -186,6 +189,7 @@ class Partition:
         self.counts: Counter[str] = Counter()
         self.last = 0
         self.announced = dict(announced or {})
+        self.refused: set[str] = set()
         self._resolve, self._budget = resolve, budget
         self._robots: dict[str, _Robot] = {}
         self._groups: dict[str, _Group] = {}
@@ -197,6 +201,9 @@ class Partition:
             if message.number <= self.last:  # delivered again
                 continue
             self.last = message.number
+            if message.robot in self.refused:
+                self.counts[REFUSED] += 1
+                continue
             try:
                 if message.kind == PROFILE:
                     self._announce(message)
@@ -207,10 +214,10 @@ class Partition:
             except InputError:
                 self.counts[MALFORMED] += 1
         changes = list[AlarmChange]()
-        for key, group in self._groups.items():
+        for group in self._groups.values():
             for judged in group.judgements():
                 for row, message in judged.items():
-                    changes += self._changes(self._robots[message.robot], key, row, message)
+                    changes += self._changes(self._robots[message.robot], row, message)
         return changes
 
     def _announce(self, message: Envelope) -> None:
@@ -254,41 +261,34 @@ class Partition:
         self._robots[message.robot] = robot
         return robot
 
-    def _changes(
-        self, robot: _Robot, key: str, row: int, message: Envelope
-    ) -> list[AlarmChange]:
-        """Return what has changed of the alarm of a robot."""
-        monitor = self._groups[key].monitor
+    def _changes(self, robot: _Robot, row: int, message: Envelope) -> list[AlarmChange]:
+        """Return what has changed of the alarm of a robot that was judged."""
+        monitor = self._groups[robot.kind].monitor
         before, now = robot.told, monitor.alarm(row)
         robot.told = now
-        name, stood = message.robot, before.cause if before.state == RAISED else ""
-        found = list[AlarmChange]()
+        old = before.episode if before.state == RAISED else None
+        new = now.episode if now.state == RAISED else None
+        if (None if old is None else old.number) == (None if new is None else new.number):
+            return []
+        said = monitor.diagnosis(row) or monitor.fleet.undecided(row, "nothing is known")
         stream_s = float(monitor.fleet.times[row])
-        common = AlarmChange(
-            name, robot.life, 0, "", "", stood, message.server_s, stream_s, message.number, {}
-        )
-        if before.state == RAISED and before.episode is not None:
-            ended = now.state != RAISED or now.episode is None
-            if ended or now.episode.number != before.episode.number:
-                number = before.episode.number
-                found.append(
-                    replace(common, episode=number, state=CLEARED, cause=stood)
-                )
-        if now.state == RAISED and now.episode is not None:
-            new = before.episode is None or before.state != RAISED
-            if new or before.episode.number != now.episode.number:
-                said = monitor.diagnosis(row)
-                table = {} if said is None else asdict(replace(said, run=name))
-                found.append(
-                    replace(
-                        common,
-                        episode=now.episode.number,
-                        state=RAISED,
-                        cause=now.cause,
-                        diagnosis=table,
-                    )
-                )
-        return found
+
+        def change(episode: Episode, state: str) -> AlarmChange:
+            return AlarmChange(
+                message.robot,
+                robot.life,
+                episode.number,
+                state,
+                episode.cause,
+                "" if old is None else old.cause,
+                message.server_s,
+                stream_s,
+                message.number,
+                asdict(replace(said, run=message.robot)),
+            )
+
+        found = [] if old is None else [change(old, CLEARED)]
+        return found if new is None else [*found, change(new, RAISED)]
 
     def health(self) -> dict[str, dict[str, Any]]:
         """Return the state of each robot, and what was left out of its messages."""
@@ -339,6 +339,7 @@ class Partition:
             "last": self.last,
             "counts": dict(self.counts),
             "announced": {name: asdict(one) for name, one in self.announced.items()},
+            "refused": sorted(self.refused),
             "groups": groups,
             "robots": robots,
         }
@@ -361,6 +362,7 @@ class Partition:
             raise InputError(f"a snapshot of format {header['format']}, expected {FORMAT}.")
         made = cls(resolve, budget, {n: ProfileMessage(**p) for n, p in header["announced"].items()})
         made.counts, made.last = Counter(header["counts"]), header["last"]
+        made.refused = set(header["refused"])
         for number, table in enumerate(header["groups"]):
             profile = ProfileMessage(**table["profile"])
             group = _Group(resolve(profile), budget)

@@ -332,4 +332,5 @@ def _since_rest(
         far = there & (np.linalg.norm(off, axis=-1) > same_place_m)
     kept = there & (number > np.where(far, number, -1).max(axis=1, keepdims=True))
     first = np.where(kept, time, np.inf).min(axis=1)
-    return kept & (time[last] - first >= REST_S)[:, None]
+    newest_s = np.where(np.isfinite(first), time[last], -np.inf)
+    return kept & (newest_s - first >= REST_S)[:, None]
