@@ -49,7 +49,9 @@ class NatsServer:
 
     def __init__(self, folder, extra="", partitions=2):
         self._program = need_program("nats-server")
-        pytest.importorskip("nats", reason="nats-py is not installed: pip install 'failuretwin[fleet]'")
+        pytest.importorskip(
+            "nats", reason="nats-py is not installed: pip install 'failuretwin[fleet]'"
+        )
         self.folder, self.port, self.mqtt_port = folder, free_port(), free_port()
         folder.mkdir(parents=True, exist_ok=True)
         config = server_config(self.port, self.mqtt_port, folder / "data", partitions)
@@ -62,10 +64,10 @@ class NatsServer:
         return f"nats://127.0.0.1:{self.port}"
 
     def start(self):
-        log = (self.folder / "nats.log").open("ab")
-        self.process = subprocess.Popen(
-            [self._program, "-c", str(self.folder / "nats.conf")], stdout=log, stderr=log
-        )
+        with (self.folder / "nats.log").open("ab") as log:
+            self.process = subprocess.Popen(
+                [self._program, "-c", str(self.folder / "nats.conf")], stdout=log, stderr=log
+            )
         wait_for(self.port, self.process)
 
     def kill(self):
@@ -87,8 +89,8 @@ class Mosquitto:
         self.port = free_port()
         path = folder / "mosquitto.conf"
         path.write_text(f"listener {self.port} 127.0.0.1\nallow_anonymous true\n{config}\n")
-        log = (folder / "mosquitto.log").open("ab")
-        self.process = subprocess.Popen([program, "-c", str(path)], stdout=log, stderr=log)
+        with (folder / "mosquitto.log").open("ab") as log:
+            self.process = subprocess.Popen([program, "-c", str(path)], stdout=log, stderr=log)
         wait_for(self.port, self.process)
 
     def close(self):

@@ -13,7 +13,7 @@ from failuretwin.app.commands.options import LiveOptions, RobotOptions
 from failuretwin.app.fleet import run_until_stopped
 from failuretwin.app.terminal import tell
 from failuretwin.connection.fleet.bridge import Publisher, bridge_fleet, bridge_source
-from failuretwin.connection.fleet.broker import Access, open_broker
+from failuretwin.connection.fleet.broker import Access, Broker, open_broker
 from failuretwin.connection.fleet.emulated_fleet import EmulatedFleet
 from failuretwin.connection.fleet.messages import ROBOT_NAME, ProfileMessage
 from failuretwin.core.errors import InputError, counted
@@ -69,7 +69,7 @@ def bridge_emulated(
     run_until_stopped(main)
 
 
-def _publisher(broker, robot: RobotOptions, json: bool) -> Publisher:
+def _publisher(broker: Broker, robot: RobotOptions, json: bool) -> Publisher:
     return Publisher(broker, tell, None if json else len(robot.model.motors))
 
 
@@ -79,5 +79,7 @@ def _profile(name: str, robot: RobotOptions) -> ProfileMessage:
     if robot.calibration is None:
         return ProfileMessage(robot.model.name)
     if not robot.calibration.is_file():
-        raise InputError(f"--calibration {robot.calibration}: expected a file, which is sent along.")
+        raise InputError(
+            f"--calibration {robot.calibration}: expected a file, to be sent along."
+        )
     return ProfileMessage(robot.model.name, read_text(robot.calibration, "a calibration"))

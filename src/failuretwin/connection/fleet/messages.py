@@ -97,13 +97,13 @@ def parse_events(data: bytes, motors: int) -> Events:
         motors: Number of motors of the robot.
 
     Raises:
-        InputError: If it holds none, or a value that is no finite number of a possible size.
+        InputError: If it has another form, or a value that is no finite number of a possible size.
     """
     if len(data) > LARGEST:
         raise InputError(f"a message of {len(data)} bytes, expected {LARGEST} at most.")
     found = _binary(data, motors) if data.startswith(MAGIC) else _json(data, motors)
-    if not 0 < found.count <= MOST_EVENTS:
-        raise InputError(f"{found.count} readings and commands, expected 1 to {MOST_EVENTS}.")
+    if found.count > MOST_EVENTS:
+        raise InputError(f"{found.count} readings and commands, expected {MOST_EVENTS} at most.")
     for rows in (found.readings, found.commands):
         times, values = rows[:, 0], rows[:, 1:]
         fits = (np.abs(times) <= LARGEST_TIME).all() and (np.abs(values) <= LARGEST_VALUE).all()
@@ -133,12 +133,16 @@ def _binary(data: bytes, motors: int) -> Events:
 
 def _json(data: bytes, motors: int) -> Events:
     table = _table(data)
+    if not table.keys() & {"readings", "commands", "tool", "target"}:
+        raise InputError(f"keys {_short(sorted(table))}, expected readings, commands, or one of them.")
     readings = table.get("readings", [table] if "tool" in table else [])
     commands = table.get("commands", [table] if "target" in table else [])
     try:
         return Events(
             _rows([[one["t"], *one["tool"]] for one in readings], 4),
-            _rows([[one["t"], *one["target"], *one["duration"]] for one in commands], 1 + 2 * motors),
+            _rows(
+                [[one["t"], *one["target"], *one["duration"]] for one in commands], 1 + 2 * motors
+            ),
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(

@@ -130,6 +130,8 @@ class RobotInput:
         made._known.extend((stamp, reading) for stamp, reading in state["known"])
         ramp = state["ramp"]
         known = None if ramp is None else Ramp(ramp[0], *map(np.array, ramp[1:]))
-        pending = [CommandSent(at, np.array(to), np.array(for_s)) for at, to, for_s in state["pending"]]
+        pending = [
+            CommandSent(at, np.array(to), np.array(for_s)) for at, to, for_s in state["pending"]
+        ]
         made._reference.resume(known, pending, state["until"])
         return made

@@ -36,6 +36,13 @@ class Metrics:
             "failuretwin_snapshot_seconds", "Time to write a snapshot", **to
         )
 
+        self._states: set[str] = set()
+
+    def forget(self, partition: str) -> None:
+        """Drop the figures of a partition that is held no longer."""
+        for figure in (self.left_out, self.robots, self.pending, self.lag, self.snapshot_bytes):
+            figure.remove_by_labels({"partition": partition})
+
     def serve(self, host: str, port: int) -> None:
         """Serve the figures at an address.
 
@@ -53,9 +60,10 @@ class Metrics:
         """Take the health of a partition."""
         self.pending.labels(partition).set(report["pending"])
         self.lag.labels(partition).set(report["lag_s"])
-        robots = report["robots"].values()
-        for state, count in Counter(one["state"] for one in robots).items():
-            self.robots.labels(partition, state).set(count)
+        states = Counter(one["state"] for one in report["robots"].values())
+        self._states |= set(states)
+        for state in self._states:
+            self.robots.labels(partition, state).set(states[state])
         for reason, count in left_out(report).items():
             self.left_out.labels(partition, reason).set(count)
 

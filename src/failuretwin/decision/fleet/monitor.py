@@ -102,9 +102,7 @@ class FleetMonitor:
         told = log_of(self._mixture.posterior(belief)[0]), np.zeros(shape)
         return self.fleet.diagnosis(robot, told=told)
 
-    def _advance(
-        self, likelihood: RunLikelihood, robots: IntArray, begin: int, end: int
-    ) -> None:
+    def _advance(self, likelihood: RunLikelihood, robots: IntArray, begin: int, end: int) -> None:
         """Follow the movements from `begin` to `end` of some robots; the last is the present one.
 
         Movements that are over are counted once and for all; the present one as it looks now.

@@ -360,7 +360,9 @@ class Partition:
         header = json.loads(arrays.pop("header").tobytes())
         if header["format"] != FORMAT:
             raise InputError(f"a snapshot of format {header['format']}, expected {FORMAT}.")
-        made = cls(resolve, budget, {n: ProfileMessage(**p) for n, p in header["announced"].items()})
+        made = cls(
+            resolve, budget, {n: ProfileMessage(**p) for n, p in header["announced"].items()}
+        )
         made.counts, made.last = Counter(header["counts"]), header["last"]
         made.refused = set(header["refused"])
         for number, table in enumerate(header["groups"]):

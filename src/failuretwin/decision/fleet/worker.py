@@ -50,7 +50,11 @@ BEHIND_S = 10.0
 STALE = "stale"
 
 
-class LeaseLost(Exception):
+ABANDON_S = 5.0
+"""Longest wait for work that is abandoned [s]."""
+
+
+class LeaseLostError(Exception):
     """Somebody else holds the partition by now."""
 
 
@@ -200,9 +204,7 @@ class Worker:
         free = [k for k in range(self.settings.partitions) if f"p{k}" not in taken]
         for number in free[:most]:
             try:
-                lease = await self.buckets.leases.create(
-                    f"p{number}", self.settings.name.encode()
-                )
+                lease = await self.buckets.leases.create(f"p{number}", self.settings.name.encode())
             except KeyWrongLastSequenceError:  # somebody was faster
                 continue
             self._held[number] = _Holder(self, number, lease)
@@ -219,9 +221,8 @@ class Worker:
     async def _drop(self, holder: _Holder, why: str) -> None:
         self._held.pop(holder.number, None)
         self.outlets.metrics.partitions.set(len(self._held))
-        holder.task.cancel()
-        with suppress(asyncio.CancelledError, Exception):
-            await holder.task
+        await holder.abandon()
+        self.outlets.metrics.forget(holder.key)
         if why:
             self.outlets.tell(f"partition {holder.number} is given up: {why}")
 
@@ -261,7 +262,7 @@ class _Holder:
         self._skew_s = math.inf
         self._pending, self._taken = 0, 0
         self._reported = _Reported()
-        self._careful = False
+        self._careful = self._abandoned = False
         self._source: JetStreamContext.PullSubscription | None = None
         self._partition: Partition
         self.task = asyncio.create_task(self._run())
@@ -270,6 +271,15 @@ class _Holder:
         """End the work with a snapshot."""
         self._stop.set()
         await self.task
+
+    async def abandon(self) -> None:
+        """End the work at once, without a snapshot."""
+        self._abandoned = True
+        self._stop.set()
+        self.task.cancel()
+        await asyncio.wait({self.task}, timeout=ABANDON_S)
+        if self.task.done() and not self.task.cancelled():
+            self.task.exception()  # was told
 
     async def _run(self) -> None:
         try:
@@ -282,7 +292,8 @@ class _Holder:
                     await self._save()
                 if not full:
                     await asyncio.sleep(max(0.0, CYCLE_S - (time.monotonic() - begun_s)))
-            await self._save()
+            if not self._abandoned:
+                await self._save()
         except Exception as error:
             self._worker.outlets.tell(f"partition {self.number}: {_short(error)}")
             raise
@@ -437,7 +448,7 @@ class _Holder:
         """Return the result of work with the server, tried until it answers.
 
         Raises:
-            LeaseLost: If the lease has ended meanwhile.
+            LeaseLostError: If the lease has ended meanwhile.
         """
         from nats.errors import Error
 
@@ -446,7 +457,7 @@ class _Holder:
                 return await work(*values)
             except (Error, OSError, TimeoutError):
                 if time.monotonic() - self.renewed_s > 2.0 * names.LEASE_S:
-                    raise LeaseLost(f"partition {self.number}") from None
+                    raise LeaseLostError(f"partition {self.number}") from None
                 await asyncio.sleep(0.5)
 
     async def _save(self) -> None:
@@ -470,7 +481,7 @@ class _Holder:
         metrics.snapshot_seconds.observe(time.monotonic() - begun_s)
 
     async def _store(self, data: bytes, last: int) -> None:
-        from nats.js.errors import KeyWrongLastSequenceError
+        from nats.js.errors import KeyWrongLastSequenceError, NotFoundError
 
         buckets, stream = self._worker.buckets, self._worker.broker.stream
         name, old = f"{self.key}-{last}-{uuid.uuid4().hex[:8]}", self._object
@@ -479,12 +490,17 @@ class _Holder:
         # Only who has written the last pointer, or read it when taking over, may replace it.
         try:
             self._pointer = await buckets.snapshots.update(self.key, pointer, last=self._pointer)
-        except KeyWrongLastSequenceError:  # of one that was paused: it says the same of its time
-            self._pointer = (await buckets.snapshots.get(self.key)).revision or 0
+        except KeyWrongLastSequenceError:
+            await buckets.states.delete(name)
+            entry = await buckets.snapshots.get(self.key)
+            if json.loads(entry.value or b"{}")["last"] > last:  # we were paused for long
+                raise LeaseLostError(f"partition {self.number} has gone on without us") from None
+            self._pointer = entry.revision or 0  # the other was
             raise
         self._object = name
         if old:
-            await buckets.states.delete(old)
+            with suppress(NotFoundError):
+                await buckets.states.delete(old)
         message, self._last_message = self._last_message, None
         if message is not None:
             await message.ack()
@@ -514,11 +530,15 @@ class _Holder:
         }
         self._taken = 0
         states = {name: (one["state"], one["cause"]) for name, one in robots.items()}
-        changed = {name: robots[name] for name, now in states.items() if before.states.get(name) != now}
+        changed = {
+            name: robots[name] for name, now in states.items() if before.states.get(name) != now
+        }
         behind = lag_s > BEHIND_S
         if behind != before.behind:
             said = f"cannot follow: {self._pending} messages, {lag_s:.0f} s behind; nothing is lost"
-            self._worker.outlets.tell(f"partition {self.number}: {said if behind else 'follows again'}")
+            self._worker.outlets.tell(
+                f"partition {self.number}: {said if behind else 'follows again'}"
+            )
         self._reported = _Reported(now_s, states, behind)
         self._worker.outlets.metrics.report(self.key, report)
         await self._publish_health(report, changed)

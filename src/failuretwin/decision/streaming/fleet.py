@@ -457,9 +457,7 @@ class StreamingFleet:
             )
         return found
 
-    def _alive(
-        self, time: FloatArray, command: FloatArray, points: FloatArray
-    ) -> FloatArray:
+    def _alive(self, time: FloatArray, command: FloatArray, points: FloatArray) -> FloatArray:
         """Return the readings without those of dead sensors.
 
         What such a sensor said before that was noticed is forgotten.

@@ -238,8 +238,8 @@ class SampleBuffer:
         at = robots[:, None], np.where(there, self._first[:, None] + place, 0)
         return {
             "samples/time": np.where(there, self._time[at], np.inf),
-            "samples/command": self._command[at],
-            "samples/measured": self._measured[at],
+            "samples/command": np.where(there[..., None], self._command[at], np.nan),
+            "samples/measured": np.where(there[..., None], self._measured[at], np.nan),
         }
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
@@ -271,8 +271,9 @@ class SampleBuffer:
         """Move the samples of every robot to the begin of a room of another size."""
         count = self._stop - self._first
         place = np.arange(int(count.max(initial=0)))
-        at = np.arange(len(count))[:, None], np.minimum(
-            self._first[:, None] + place, self._time.shape[1] - 1
+        at = (
+            np.arange(len(count))[:, None],
+            np.minimum(self._first[:, None] + place, self._time.shape[1] - 1),
         )
         for name in ("_time", "_command", "_measured"):
             old = getattr(self, name)
