@@ -79,7 +79,5 @@ def _profile(name: str, robot: RobotOptions) -> ProfileMessage:
     if robot.calibration is None:
         return ProfileMessage(robot.model.name)
     if not robot.calibration.is_file():
-        raise InputError(
-            f"--calibration {robot.calibration}: expected a file, to be sent along."
-        )
+        raise InputError(f"--calibration {robot.calibration}: expected a file, to be sent along.")
     return ProfileMessage(robot.model.name, read_text(robot.calibration, "a calibration"))

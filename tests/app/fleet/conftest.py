@@ -1,11 +1,6 @@
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "decision" / "fleet"))
 
 from failuretwin.decision.fleet.partition import Partition
 from fleet_messages import envelopes, played, resolve

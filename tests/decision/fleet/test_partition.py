@@ -58,9 +58,7 @@ def test_a_snapshot_goes_on_bit_for_bit(alone):
         found += partition.take(messages[first : first + 60])
         partition = Partition.restored(partition.snapshot(), resolve)
     assert decided(found) == decided(changes)
-    ours, theirs = (
-        next(iter(one._groups.values())).monitor.state() for one in (partition, whole)
-    )
+    ours, theirs = (next(iter(one._groups.values())).monitor.state() for one in (partition, whole))
     assert ours.keys() == theirs.keys()
     for name, value in ours.items():
         np.testing.assert_array_equal(value, theirs[name][: len(value)], err_msg=name)

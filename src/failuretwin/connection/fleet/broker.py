@@ -212,15 +212,16 @@ async def open_broker(access: Access, name: str) -> Broker:
             connect_timeout=5,
             reconnect_time_wait=TRIES_S,
             max_reconnect_attempts=-1,
-            allow_reconnect=True,
+            allow_reconnect=False,
             **options,
         )
-        return Broker(client)
-    except (Error, OSError) as error:
+    except (Error, OSError, TimeoutError) as error:
         raise InputError(
             f"fleet server {access.shown}: {seen[-1] if seen else error}. Expected a NATS server "
             "with JetStream that lets us in; see docs/fleet.md."
         ) from error
+    client.options["allow_reconnect"] = True  # it has let us in once
+    return Broker(client)
 
 
 def server_config(port: int, mqtt_port: int, folder: Path, partitions: int = PARTITIONS) -> str:

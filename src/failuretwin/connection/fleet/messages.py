@@ -134,7 +134,9 @@ def _binary(data: bytes, motors: int) -> Events:
 def _json(data: bytes, motors: int) -> Events:
     table = _table(data)
     if not table.keys() & {"readings", "commands", "tool", "target"}:
-        raise InputError(f"keys {_short(sorted(table))}, expected readings, commands, or one of them.")
+        raise InputError(
+            f"keys {_short(sorted(table))}, expected readings, commands, or one of them."
+        )
     readings = table.get("readings", [table] if "tool" in table else [])
     commands = table.get("commands", [table] if "target" in table else [])
     try:

@@ -17,25 +17,26 @@ class Metrics:
             from prometheus_client import CollectorRegistry, Gauge, Summary
             from prometheus_client import Counter as Total
         self.registry = CollectorRegistry()
-        to = {"registry": self.registry}
-        self.workers = Gauge("failuretwin_workers", "Workers alive", **to)
-        self.partitions = Gauge("failuretwin_partitions", "Partitions held", **to)
-        self.taken_over = Total("failuretwin_takeovers", "Partitions taken", **to)
-        self.messages = Total("failuretwin_messages", "Messages filtered", **to)
-        self.alarms = Total("failuretwin_alarms", "Changes of alarms", ["state"], **to)
-        self.left_out = Gauge(
-            "failuretwin_left_out", "Messages and events left out", ["partition", "reason"], **to
-        )
-        self.robots = Gauge("failuretwin_robots", "Robots", ["partition", "state"], **to)
-        self.pending = Gauge("failuretwin_pending", "Messages that wait", ["partition"], **to)
-        self.lag = Gauge("failuretwin_lag_seconds", "Delay of the filter", ["partition"], **to)
-        self.snapshot_bytes = Gauge(
-            "failuretwin_snapshot_bytes", "Size of a snapshot", ["partition"], **to
-        )
-        self.snapshot_seconds = Summary(
-            "failuretwin_snapshot_seconds", "Time to write a snapshot", **to
-        )
 
+        def gauge(name: str, text: str, *labels: str) -> Gauge:
+            return Gauge(f"failuretwin_{name}", text, labels, registry=self.registry)
+
+        def total(name: str, text: str, *labels: str) -> Total:
+            return Total(f"failuretwin_{name}", text, labels, registry=self.registry)
+
+        self.workers = gauge("workers", "Workers alive")
+        self.partitions = gauge("partitions", "Partitions held")
+        self.taken_over = total("takeovers", "Partitions taken")
+        self.messages = total("messages", "Messages filtered")
+        self.alarms = total("alarms", "Changes of alarms", "state")
+        self.left_out = gauge("left_out", "Messages and events left out", "partition", "reason")
+        self.robots = gauge("robots", "Robots", "partition", "state")
+        self.pending = gauge("pending", "Messages that wait", "partition")
+        self.lag = gauge("lag_seconds", "Delay of the filter", "partition")
+        self.snapshot_bytes = gauge("snapshot_bytes", "Size of a snapshot", "partition")
+        self.snapshot_seconds = Summary(
+            "failuretwin_snapshot_seconds", "Time to write a snapshot", registry=self.registry
+        )
         self._states: set[str] = set()
 
     def forget(self, partition: str) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
 from numbers import Real
 from typing import Annotated
 
@@ -394,7 +393,7 @@ class StreamingFleet:
         Small numbers are exact.
         """
         alone = isinstance(time, Real)
-        if not (isfinite(time) if alone else np.shape(time) == (self.robots,)):
+        if not (np.isfinite(time) if alone else np.shape(time) == (self.robots,)):
             raise InputError(
                 f"a sample is of {time!r} s. Expected one finite number, or one of each robot."
             )

@@ -22,7 +22,7 @@ from failuretwin.connection.fleet.broker import (
 from failuretwin.decision.fleet.metrics import Metrics
 from failuretwin.decision.fleet.worker import Outlets, Settings, Worker
 
-PATIENCE_S = 60.0
+PATIENCE_S = 30.0
 
 
 def ask(url, question):
@@ -94,6 +94,10 @@ def worker_thread(url, name="inside", retain=None, access=None):
     thread = threading.Thread(target=run)
     thread.start()
     assert ready.wait(20.0)
+    end = time.monotonic() + PATIENCE_S
+    while sum("from message" in line for line in told) < 2:  # it holds both partitions
+        assert thread.is_alive() and time.monotonic() < end, told
+        time.sleep(0.05)
     try:
         yield told, metrics
     finally:
