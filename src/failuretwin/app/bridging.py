@@ -30,7 +30,7 @@ def bridge_one(
         with ExitStack() as stack:
             link, _ = connect(source, robot.model, live, robot.seed, stack)
             broker = await open_broker(access, f"bridge-{name}")
-            publisher = _publisher(broker, robot, json)
+            publisher = _publisher(broker, stop, robot, json)
             await publisher.announce([name], profile)
             tell(f"{name}: {link.name} to {access.shown}; stop with Ctrl-C")
             await bridge_source(link, name, publisher, stop)
@@ -58,7 +58,7 @@ def bridge_emulated(
 
     async def main(stop: asyncio.Event) -> None:
         broker = await open_broker(access, f"bridge-{name}")
-        publisher = _publisher(broker, robot, json)
+        publisher = _publisher(broker, stop, robot, json)
         fleet = EmulatedFleet(arms, time.time(), live.seconds or math.inf)
         await publisher.announce(fleet.names, profile)
         tell(f"{counted(robots, 'emulated robot')} to {access.shown}; stop with Ctrl-C")
@@ -69,8 +69,8 @@ def bridge_emulated(
     run_until_stopped(main)
 
 
-def _publisher(broker: Broker, robot: RobotOptions, json: bool) -> Publisher:
-    return Publisher(broker, tell, None if json else len(robot.model.motors))
+def _publisher(broker: Broker, stop: asyncio.Event, robot: RobotOptions, json: bool) -> Publisher:
+    return Publisher(broker, tell, stop, None if json else len(robot.model.motors))
 
 
 def _profile(name: str, robot: RobotOptions) -> ProfileMessage:

@@ -35,13 +35,22 @@ class Publisher:
     Args:
         broker: The server.
         tell: Takes a line for the user.
+        stop: Ends the wait for a server that takes no messages.
         motors: Number of motors, for the compact form; None: JSON.
+
+    Attributes:
+        sent: Messages that the server has stored.
     """
 
     def __init__(
-        self, broker: Broker, tell: Callable[[str], None], motors: int | None = None
+        self,
+        broker: Broker,
+        tell: Callable[[str], None],
+        stop: asyncio.Event,
+        motors: int | None = None,
     ) -> None:
-        self.sent = 0
+        self.sent = self._made = 0
+        self._stop = stop
         self._broker, self._tell, self._motors = broker, tell, motors
         self._own = uuid.uuid4().hex[:8]
         self._waits = False
@@ -70,9 +79,9 @@ class Publisher:
     async def _store(self, subject: str, data: bytes) -> None:
         from nats.errors import Error
 
-        self.sent += 1
-        headers = {"Nats-Msg-Id": f"{self._own}-{self.sent}"}
-        while True:
+        self._made += 1
+        headers = {"Nats-Msg-Id": f"{self._own}-{self._made}"}
+        while not self._stop.is_set():
             try:
                 await self._broker.stream.publish(
                     subject, data, stream=EVENTS_STREAM, headers=headers
@@ -84,6 +93,7 @@ class Publisher:
                     self._tell(f"the server takes no messages ({why}); waiting")
                 await asyncio.sleep(RETRY_S)
                 continue
+            self.sent += 1
             if self._waits:
                 self._waits = False
                 self._tell("the server takes messages again")
