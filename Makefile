@@ -4,13 +4,17 @@ BIN := .venv/bin
 # Small arrays gain nothing from threads, and threads of several processes get in each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test docs links notebooks pages wheel bench calibrations lint format clean
+.PHONY: demo fleet test docs links notebooks pages wheel bench calibrations lint format clean
 
 demo: .venv/demo
 	$(BIN)/python examples/demo.py
 
 test: .venv/ready lint
 	$(BIN)/pytest -m "not slow" --numprocesses 2 --dist loadfile
+
+# A server, 100 emulated robots and two workers on this computer, until Ctrl-C.
+fleet: .venv/fleet
+	$(BIN)/python examples/fleet/start.py
 
 # The site is build/site/index.html. Warnings are errors, links between pages among them.
 docs: .venv/docs
@@ -62,13 +66,15 @@ format: .venv/ready
 
 .venv/demo: EXTRA := plots
 .venv/demo: SIZE := 0.5 GB on disk, a minute or two
+.venv/fleet: EXTRA := fleet,physics,store
+.venv/fleet: SIZE := 0.7 GB on disk, a minute or two
 .venv/docs: EXTRA := docs
 .venv/docs: SIZE := 0.7 GB on disk, a minute or two
 .venv/release: EXTRA := release
 .venv/release: SIZE := 0.5 GB on disk, a minute or two
 .venv/ready: EXTRA := dev
 .venv/ready: SIZE := 2 to 6 GB on disk, by what comes with PyTorch; some minutes
-.venv/demo .venv/docs .venv/release .venv/ready: pyproject.toml constraints.txt | .venv/made
+.venv/demo .venv/docs .venv/fleet .venv/release .venv/ready: pyproject.toml constraints.txt | .venv/made
 	@echo "installing failuretwin[$(EXTRA)] into .venv: $(SIZE)"
 	$(BIN)/pip install --constraint constraints.txt --editable '.[$(EXTRA)]'
 	touch $@

@@ -18,6 +18,7 @@ from failuretwin.app.commands.check import check, design, isolability
 from failuretwin.app.commands.data import import_, robot, simulate
 from failuretwin.app.commands.diagnose import demo, diagnose
 from failuretwin.app.commands.doctor import doctor
+from failuretwin.app.commands.fleet import bridge, fleet, worker
 from failuretwin.app.commands.learn import calibrate, study, train
 from failuretwin.app.commands.live import emulate, watch
 from failuretwin.app.commands.results import advise, evaluate
@@ -44,7 +45,7 @@ def cli() -> None:
 for command in (
     *(demo, import_, doctor, simulate, diagnose, evaluate, calibrate),
     *(train, study, emulate, watch, act, stop, reach, check, design, isolability),
-    *(advise, robot, store, history, found, repaired, query),
+    *(advise, robot, store, history, found, repaired, query, bridge, worker, fleet),
 ):
     cli.add_command(command)
 

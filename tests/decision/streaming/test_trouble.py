@@ -94,7 +94,7 @@ def test_a_glitch_is_neither(rng):
     for k in range(400):
         point = np.full((1, 3), 0.1) if k % 20 in (3, 4) or k % 33 == 7 else rest
         assert not jumps.see(point, 0.02)[0]
-        untold.see(0.1 * k, point, rest, TOLD, ~TOLD, TOLD, NEAR_M, told_place(0.0))
+        untold.see(np.array([0.1 * k]), point, rest, TOLD, ~TOLD, TOLD, NEAR_M, told_place(0.0))
         assert not untold.untold[0]
 
 
@@ -103,7 +103,7 @@ def test_a_movement_that_is_under_way_is_no_motion_without_a_command():
     nowhere = np.full((1, 3), np.nan)
     for k in range(50):
         point = np.full((1, 3), 0.01 * k)
-        seen.see(0.1 * k, point, nowhere, TOLD, ~TOLD, TOLD, NEAR_M, told_place(0.0))
+        seen.see(np.array([0.1 * k]), point, nowhere, TOLD, ~TOLD, TOLD, NEAR_M, told_place(0.0))
     assert not seen.untold[0]
 
 
@@ -114,7 +114,7 @@ def test_a_lost_command_that_is_sent_again_is_a_command(aim, untold):
     for k in range(40):
         point = np.array([[min(max(0.02 * (k - 10), 0.0), 0.3), 0.0, 0.0]])
         aims = told_place(np.array([aim, 0.0, 0.0]))
-        seen.see(0.1 * k, point, rest, TOLD, ~TOLD, TOLD, NEAR_M, aims)
+        seen.see(np.array([0.1 * k]), point, rest, TOLD, ~TOLD, TOLD, NEAR_M, aims)
     assert seen.untold[0] == untold
 
 
@@ -128,7 +128,7 @@ def test_a_reading_from_before_a_stall_of_the_bus_shows_no_dead_tool(moved_after
     for time in (0.3, *np.arange(2.4, 8.0, 0.1)):
         command = np.full((1, 4), 0.0 if time < moved_after_s else 1.0)
         point = np.full((1, 3), place + 1e-4 * np.sin(time))
-        told.append(seen.see(time, TOLD, point, command, 0.002)[0][0])
+        told.append(seen.see(np.array([time]), TOLD, point, command, 0.002)[0][0])
     assert any(told) == (moved_after_s == 3.0)
 
 
@@ -138,7 +138,7 @@ def test_an_arm_that_lags_after_a_long_rest_is_not_dead():
     for time in np.arange(0.0, 8.0, 0.1):
         command = np.full((1, 4), np.clip(time - 4.0, 0.0, 1.0))
         point = np.full((1, 3), 0.2 + 0.1 * np.clip(time - 4.4, 0.0, 1.0))
-        told.append(seen.see(time, TOLD, point, command, 0.002)[0][0])
+        told.append(seen.see(np.array([time]), TOLD, point, command, 0.002)[0][0])
     assert not any(told)
 
 
@@ -164,7 +164,7 @@ def test_an_arm_that_moves_long_after_it_should_rest_is_told_without_a_rest_seen
     for k in range(60):
         point = np.full((1, 3), 0.01 * k)
         overdue = np.array([k > 30])
-        seen.see(0.1 * k, point, nowhere, TOLD, overdue, TOLD, NEAR_M, told_place(0.0))
+        seen.see(np.array([0.1 * k]), point, nowhere, TOLD, overdue, TOLD, NEAR_M, told_place(0.0))
         first = k if first is None and seen.untold[0] else first
     assert first == 34
 

@@ -168,23 +168,30 @@ class LiveReference:
 
     Attributes:
         late_s: Longest delay of a command after the time at which it should have started [s].
+        ramp: The lines that are drawn; None before the first command or pose.
+        pending: Commands of the future, in the order of their times.
+        known_until: Time up to which corners were returned [s].
     """
 
     def __init__(self) -> None:
         self.late_s = 0.0
-        self._ramp: Ramp | None = None
-        self._pending: list[CommandSent] = []
-        self._known_until = -np.inf
+        self.ramp: Ramp | None = None
+        self.pending: list[CommandSent] = []
+        self.known_until = -np.inf
+
+    def resume(self, ramp: Ramp | None, pending: list[CommandSent], known_until: float) -> None:
+        """Go on from where another reference was."""
+        self.ramp, self.pending, self.known_until = ramp, pending, known_until
 
     def start_at(self, pose: FloatArray) -> None:
         """Set the pose before the first command, (motor,) [rad]; no effect later."""
-        if self._ramp is None:
-            self._ramp = Ramp(-np.inf, pose, pose, np.zeros_like(pose))
+        if self.ramp is None:
+            self.ramp = Ramp(-np.inf, pose, pose, np.zeros_like(pose))
 
     def add(self, command: CommandSent) -> None:
         """Add a command; its time may be in the future or a little in the past."""
-        self._pending = [other for other in self._pending if other.time < command.time]
-        insort(self._pending, command, key=lambda other: other.time)
+        self.pending = [other for other in self.pending if other.time < command.time]
+        insort(self.pending, command, key=lambda other: other.time)
 
     def corners_to(self, time: float) -> list[Corner]:
         """Return the corners since the last call, up to a time [s], and the reference then.
@@ -192,29 +199,29 @@ class LiveReference:
         Nothing is returned before the first command or pose.
         """
         corners: list[Corner] = []
-        while self._pending and self._pending[0].time <= time:
-            corners += self._begin(self._pending.pop(0))
+        while self.pending and self.pending[0].time <= time:
+            corners += self._begin(self.pending.pop(0))
         corners += self._draw_to(time)
-        self._known_until = max(self._known_until, time)
+        self.known_until = max(self.known_until, time)
         return corners
 
     def _begin(self, command: CommandSent) -> list[Corner]:
         """Begin a command and return the corners up to then."""
         # Corners that were returned cannot be changed: a command that comes late starts late.
-        start = max(command.time, self._known_until)
+        start = max(command.time, self.known_until)
         late = start - command.time
         self.late_s = max(self.late_s, late)
         corners = self._draw_to(start)
-        origin = command.target if self._ramp is None else self._ramp.at(start)
-        self._ramp = Ramp(start, origin, command.target, np.maximum(command.duration - late, 0.0))
+        origin = command.target if self.ramp is None else self.ramp.at(start)
+        self.ramp = Ramp(start, origin, command.target, np.maximum(command.duration - late, 0.0))
         return corners
 
     def _draw_to(self, time: float) -> list[Corner]:
         """Return the ends of the motors' ramps up to a time [s], and the reference then."""
-        ramp, known = self._ramp, self._known_until
+        ramp, known = self.ramp, self.known_until
         if ramp is None or time <= known:
             return []
-        self._known_until = time
+        self.known_until = time
         ends = np.unique(ramp.start + ramp.duration)
         times = [*ends[(known < ends) & (ends < time)].tolist(), time]
         return [(at, ramp.at(at)) for at in times]

@@ -21,7 +21,7 @@ import sqlalchemy as sa
 
 from failuretwin import __version__
 from failuretwin.core.errors import InputError, check_name
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import measured_rate
 from failuretwin.data_knowledge.records import writing
 from failuretwin.data_knowledge.records.beliefs import (
@@ -183,6 +183,48 @@ class Store(StoreReader):
             of = SessionRows(session, row, known[0] if known else None)
             first = follow_notes(connection, of, happened)
         return Session(self._database, of, first)
+
+    def keep_alarm(
+        self,
+        robot: str,
+        *,
+        identity: str,
+        text: str,
+        at: datetime,
+        before: str,
+        now: str,
+        diagnosis: Diagnosis,
+    ) -> bool:
+        """Store an alarm of a fleet, once, and let the episodes of the robot follow it.
+
+        Args:
+            robot: Name of the robot, made if it is new.
+            identity: What is the same each time that the alarm is delivered.
+            text: What happened.
+            at: When (UTC).
+            before: Fault that the alarm named before; empty: none.
+            now: Fault that it names now; empty: it is cleared.
+            diagnosis: The diagnosis behind it.
+
+        Returns:
+            Whether it was new.
+
+        Raises:
+            OutputError: If it could not be stored.
+        """
+        text = f"{text} [{identity}]"
+        with self._database.writing() as connection:
+            row = writing.keep_robot(connection, robot, None)
+            if writing.is_noted(connection, row, text):
+                return False
+            at_log = writing.keep_log(connection, row, LogFile("fleet", None, 0, at))
+            run = writing.keep_runs(connection, at_log, [identity], [None])[0]
+            session = writing.add_session(connection, row, Basis("worker"))
+            rows = SessionRows(session, row, run)
+            named = Hypothesis.parse(before).faults if before else ()
+            alarmed = tuple(fault.motor for fault in named)
+            follow_notes(connection, rows, [Note(at, text, diagnosis, now)], alarmed)
+        return True
 
     def keep_belief(
         self,

@@ -31,6 +31,7 @@ from failuretwin.data_knowledge.records.schema import (
     episode_events,
     episodes,
     logs,
+    notes,
     profiles,
     robots,
     runs,
@@ -58,6 +59,12 @@ def find_robot(connection: sa.Connection, name: str) -> int:
             )
         raise unknown_name("robot", name, known)
     return row
+
+
+def is_noted(connection: sa.Connection, robot: int, text: str) -> bool:
+    """Return whether a note of a robot has just this text."""
+    query = sa.select(notes.c.id).where(notes.c.robot_id == robot, notes.c.text == text)
+    return connection.scalar(query.limit(1)) is not None
 
 
 def keep_robot(connection: sa.Connection, name: str, profile: Robot | None) -> int:

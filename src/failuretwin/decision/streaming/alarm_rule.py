@@ -17,7 +17,7 @@ Section: docs/inference.md#streams
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import expit
@@ -52,6 +52,7 @@ class AlarmRule:
         alarm: The alarm as it stands.
         hours: Hours of work so far, as far as nothing was wrong.
         passed: Suspicions so far that passed by themselves.
+        unnamed: Movements for which an alarm has waited for a name.
     """
 
     hypotheses: Sequence[str]
@@ -60,7 +61,7 @@ class AlarmRule:
     alarm: Alarm = ALL_CLEAR
     hours: float = 0.0
     passed: int = 0
-    _unnamed: int = field(default=0, repr=False)
+    unnamed: int = 0
 
     def __post_init__(self) -> None:
         if not 0.0 < self.per_100_h <= LARGEST_BUDGET:
@@ -104,8 +105,8 @@ class AlarmRule:
                 self._raise(last.number + 1, cause, time)
             return self.alarm
         self.hours += concluded_h
-        self._unnamed = self._unnamed + (concluded_h > 0.0) if above >= 0.0 else 0
-        if above >= 0.0 and (named or self._unnamed >= PATIENCE):
+        self.unnamed = self.unnamed + (concluded_h > 0.0) if above >= 0.0 else 0
+        if above >= 0.0 and (named or self.unnamed >= PATIENCE):
             self._raise(1 if last is None else last.number + 1, cause, time)
         elif above >= -np.log(SUSPICION):
             self.alarm = Alarm(SUSPECTED, cause, last)
@@ -115,7 +116,7 @@ class AlarmRule:
         return self.alarm
 
     def _raise(self, number: int, cause: str, time: float) -> None:
-        self._unnamed, threshold = 0, float(expit(self.log_odds))
+        self.unnamed, threshold = 0, float(expit(self.log_odds))
         self.alarm = Alarm(RAISED, cause, Episode(number, cause, time), threshold)
 
 

@@ -24,7 +24,7 @@ from failuretwin.decision.streaming.fleet import MOVEMENTS, StreamingFleet
 from failuretwin.digital_model.calibrated_robot import RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
 
-FORMAT = 5
+FORMAT = 6
 SUFFIX = ".npz"
 HEADER = "header"
 

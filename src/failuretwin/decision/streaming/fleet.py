@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
 from numbers import Real
 from typing import Annotated
 
@@ -121,8 +120,8 @@ class StreamingFleet:
         self.rounding: Rounding | None = None
         self.hypotheses = [str(hypothesis) for hypothesis in diagnoser.hypothesis_set]
         self.robots, self.rate_hz, self.movements = robots, rate_hz, movements
-        self._zero: float | None = None
-        self._now = -np.inf
+        self._zero = np.full(robots, np.nan)
+        self._now = np.full(robots, -np.inf)
         self._settings = model.settings
         self._tracker = MovementTracker(model, robots, movements, rate_hz)
         self._frozen = FrozenSensorDetector.empty(run=robots, axis=3, value=4, motor=motors)
@@ -139,7 +138,12 @@ class StreamingFleet:
     @property
     def time(self) -> float:
         """Newest time of the stream [s]."""
-        return self._now + (self._zero or 0.0)
+        return float(self.times.max())
+
+    @property
+    def times(self) -> FloatArray:
+        """Newest time of each robot, (robot,) [s]; -inf before its first sample."""
+        return self._now + np.nan_to_num(self._zero)
 
     @property
     def posterior(self) -> FloatArray:
@@ -159,7 +163,7 @@ class StreamingFleet:
 
     def update(
         self,
-        time: float,
+        time: ArrayLike,
         command: ArrayLike | None,
         measured: ArrayLike | None,
         position: ArrayLike | None = None,
@@ -168,7 +172,8 @@ class StreamingFleet:
         """Take a sample and return the robots of which something new is believed, (robot,).
 
         Args:
-            time: When it was taken [s]; a sample may come late, as long as its movement lasts.
+            time: When it was taken [s], of all robots or of each, (robot,), by its own clock; NaN:
+                there is none of this robot. A sample may come late, as long as its movement lasts.
             command: References of all motors, (robot, motor) [rad]; NaN or None: not known.
             measured: Tool positions, (robot, axis) [m]; NaN or None: no reading.
             position: What the motors report of themselves, (robot, motor) [rad], where it is
@@ -177,33 +182,47 @@ class StreamingFleet:
                 are believed.
 
         Raises:
-            InputError: If the shapes do not fit, or the time is not finite or far older than the
-                newest.
+            InputError: If the shapes do not fit, or a time is not finite or far older than the
+                newest of its robot.
+        """
+        before = self._odd.copy(), self._beliefs.dead.copy()
+        judged = self._judge(self.see(time, command, measured, position, goal))
+        odd = (self._odd != before[0]).any(axis=0) | (self._beliefs.dead & ~before[1])
+        return np.union1d(np.flatnonzero(odd), judged)
+
+    def see(
+        self,
+        time: ArrayLike,
+        command: ArrayLike | None,
+        measured: ArrayLike | None,
+        position: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
+    ) -> IntArray:
+        """Take a sample as `update` does, and return the robots to be judged anew, (robot,).
+
+        These are found to rest elsewhere than they were judged to.
         """
         motors = len(self.diagnoser.twin.robot.motors)
         reference = self._rows(command, motors, "commands")
         points = self._rows(measured, 3, "readings")
-        time = self._by_own_clock(time)
+        own = self._by_own_clock(time)
         heard_s, read = self._beliefs.heard_s, np.isfinite(points).all(axis=1)
-        heard_s[read] = np.maximum(heard_s[read], time)
-        points, died = self._alive(time, reference, points)
-        before = self._odd
+        heard_s[read] = np.maximum(heard_s[read], own[read])
+        points = self._alive(own, reference, points)
         split = self._split.see(points, self._settings.unmoved_m)
         points = np.where(split[:, None], np.nan, points)
-        away = self._astray(time, reference, points)
+        away = self._astray(own, reference, points)
         sensors = self.model.sensors
         points = sensors.reading(points, self._rows(position, motors, "motor readings"))
-        begun, at_rest = self._tracker.take(time, reference, points, away)
+        begun, at_rest = self._tracker.take(own, reference, points, away)
         self._beliefs.point[begun] = np.nan
         if sensors.goals and goal is not None:
             told = self._tracker.see_goals(self._rows(goal, motors, "goals"))
             self._beliefs.point[told] = np.nan
         self._untold.begin(np.union1d(begun, np.flatnonzero(self._tracker.references.moved)))
-        judged = self._judge(self._with_news(at_rest))
-        odd = np.flatnonzero((self._odd != before).any(axis=0))
-        return np.unique(np.concatenate([died, odd, judged]))
+        return self._with_news(at_rest)
 
-    def _astray(self, time: float, reference: FloatArray, points: FloatArray) -> BoolArray:
+    def _astray(self, time: FloatArray, reference: FloatArray, points: FloatArray) -> BoolArray:
         """Return tools that left where they rested without a command, (robot,)."""
         tracker, settings = self._tracker, self._settings
         told = (tracker.window.count > 0) | tracker.references.moved
@@ -296,6 +315,34 @@ class StreamingFleet:
         found, at, position = self._found(robot)
         return found.likelihood[at], position
 
+    def weigh(self, robots: IntArray) -> RunLikelihood:
+        """Return what the last movements of some robots say, a run each, as they look by now.
+
+        For a filter of all movements; what this stream itself believes is left as it was.
+        """
+        window = self._tracker.window
+        for robot in robots.tolist():
+            self._tracker.see_on_way(robot, int(window.count[robot]) - 1)
+        settled, _ = window.evidence(robots)
+        likelihoods = window.judge(robots, settled, self.model)
+        self._beliefs.judged[robots], self._latest = True, {}
+        self._beliefs.point[robots] = self._resting(robots)
+        return RunLikelihood(settled, self.model, remembered=likelihoods)
+
+    @property
+    def remembered(self) -> IntArray:
+        """Movements that are remembered of each robot, (robot,)."""
+        return self._tracker.window.count
+
+    @property
+    def forgotten(self) -> IntArray:
+        """Movements before them, (robot,)."""
+        return self._tracker.window.forgotten
+
+    def trouble(self, robot: int) -> str:
+        """Return why the readings of a robot say nothing of its motors; empty: they do."""
+        return self._quality(robot).fatal
+
     def adopt(self, imperfections: Imperfections) -> None:
         """Judge by another healthy behaviour from now on, the last movements too."""
         self.diagnoser = replace(self.diagnoser, imperfections=imperfections)
@@ -334,45 +381,57 @@ class StreamingFleet:
 
     def _remember(self, robots: IntArray, posterior_of_runs: Posterior) -> None:
         """Keep the last judgement, and where each robot then was, for whoever asks for words."""
-        window, zero = self._tracker.window, self._zero or 0.0
+        window = self._tracker.window
+        begin = window.zero_s + np.nan_to_num(self._zero)
         for at, robot in enumerate(robots.tolist()):
-            begin_s, older = float(window.zero_s[robot]) + zero, int(window.forgotten[robot])
+            begin_s, older = float(begin[robot]), int(window.forgotten[robot])
             self._latest[robot] = posterior_of_runs, at, StreamPosition(begin_s, older)
 
-    def _by_own_clock(self, time: float) -> float:
-        """Return the time since the first sample [s]; small numbers are exact."""
-        if not (isinstance(time, Real) and isfinite(time)):
-            raise InputError(f"a sample is of {time!r} s. Expected one finite number.")
-        if self._zero is None:
-            self._zero = time
-        own = time - self._zero
-        if own < self._now - KEEP_S:
+    def _by_own_clock(self, time: ArrayLike) -> FloatArray:
+        """Return the time of each robot since its first sample, (robot,) [s]; NaN: no sample.
+
+        Small numbers are exact.
+        """
+        alone = isinstance(time, Real)
+        if not (np.isfinite(time) if alone else np.shape(time) == (self.robots,)):
             raise InputError(
-                f"a sample is of {time} s, but the newest is of {self.time} s. Expected none older "
-                f"than {KEEP_S:g} s before the newest; where a clock was set, begin a new stream."
+                f"a sample is of {time!r} s. Expected one finite number, or one of each robot."
             )
-        self._now = max(self._now, own)
+        at = np.full(self.robots, time) if alone else as_floats(time)
+        there = np.isfinite(at)
+        first = there & np.isnan(self._zero)
+        self._zero[first] = at[first]
+        own = np.where(there, at - self._zero, np.nan)
+        old = own < self._now - KEEP_S
+        if old.any():
+            robot = int(np.argmax(old))
+            raise InputError(
+                f"a sample is of {at[robot]} s, but the newest is of {self.times[robot]} s. "
+                f"Expected none older than {KEEP_S:g} s before the newest; where a clock was set, "
+                "begin a new stream."
+            )
+        self._now = np.fmax(self._now, own)
         return own
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return all that the stream knows, by name."""
-        zero = np.nan if self._zero is None else self._zero
-        found = {"clock": np.array([zero, self._now])} | self._tracker.samples.state()
+        """Return all that the stream knows, by name; the first axis is the robot."""
+        found = {"zero": self._zero, "now": self._now} | self._tracker.samples.state()
         for name, part in self._parts.items():
             found |= part.to_arrays(name)
         return found
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Take over what `state` returned.
+        """Take over what `state` returned, of as many robots or of fewer: then of the first ones.
 
         Raises:
             KeyError: If something is missing.
             ValueError: If something is of another shape.
         """
-        zero, self._now = state["clock"].tolist()
-        self._zero = None if np.isnan(zero) else zero
+        known = slice(0, len(state["zero"]))
+        self._zero[known], self._now[known] = state["zero"], state["now"]
+        self._latest = {}
         for name, part in self._parts.items():
-            part.from_arrays(name, state)
+            part[known].from_arrays(name, state)
         self._tracker.samples.restore(state)
 
     @property
@@ -397,10 +456,8 @@ class StreamingFleet:
             )
         return found
 
-    def _alive(
-        self, time: float, command: FloatArray, points: FloatArray
-    ) -> tuple[FloatArray, IntArray]:
-        """Return the readings without those of dead sensors, and the robots newly found dead.
+    def _alive(self, time: FloatArray, command: FloatArray, points: FloatArray) -> FloatArray:
+        """Return the readings without those of dead sensors.
 
         What such a sensor said before that was noticed is forgotten.
         """
@@ -418,7 +475,7 @@ class StreamingFleet:
         for robot in np.flatnonzero(died):
             self._tracker.spoil(int(robot), self._frozen.still_since(int(robot)))
         silent = still | alone.any(axis=1)
-        return np.where(silent[:, None], np.nan, points), np.flatnonzero(died)
+        return np.where(silent[:, None], np.nan, points)
 
     def _with_news(self, robots: IntArray) -> IntArray:
         """Return the robots whose tools rest elsewhere than they were judged to."""

@@ -103,17 +103,12 @@ class FaultMonitor(RobotStream):
         self._models: list[HealthyModel] = [] if cold and learns else [known]
         if self._learner is not None:
             self._models.append(self._learner.model)
-        elif not (cold or ideal):
-            kind = generic_imperfections(known.twin.robot)
-            self._models.append(HealthyModel.of(known.twin, kind).seen_by(known.sensing))
-        hypotheses, priors = diagnoser.hypothesis_set, diagnoser.priors
-        filters = [FaultFilter(model, hypotheses, priors) for model in self._models]
-        share = [1.0] if len(filters) == 1 else [1.0 - FOREIGN, FOREIGN]
-        self._mixture = HealthyMixture(filters, np.array(share))
+        else:
+            self._models = candidates(known)
+        self._mixture = mixture_of(self._models, diagnoser)
         self._given = "" if cold else known.imperfections.name
-        self._rule = AlarmRule(
-            self._fleet.hypotheses, filters[0].faults_per_h, false_alarms_per_100h
-        )
+        rate = self._mixture.filters[0].faults_per_h
+        self._rule = AlarmRule(self._fleet.hypotheses, rate, false_alarms_per_100h)
         self._concluded = self._present = self._mixture.begin(1)
         self._movements = 0
         self._explained: dict[int, float] = {}
@@ -221,7 +216,7 @@ class FaultMonitor(RobotStream):
         new = max(self._movements - before, 0)
         part = slice(max(new - 1, 0), count)
         says = [
-            one.evidence(self._part(likelihood, model, part))
+            one.evidence(part_of(likelihood, model, part))
             for one, model in zip(self._mixture.filters, self._models, strict=True)
         ]
         belief, hours = self._concluded, 0.0
@@ -238,16 +233,6 @@ class FaultMonitor(RobotStream):
         for movement in range(new, count - 1):
             self._learn(likelihood.evidence, movement, position.begin_s)
         return posterior
-
-    @staticmethod
-    def _part(likelihood: RunLikelihood, model: HealthyModel, part: slice) -> RunLikelihood:
-        """Return what some of the last movements say by a model."""
-        if model is not likelihood.model:
-            likelihood = RunLikelihood(likelihood.evidence, model)
-        rows = slice(None), part
-        evidence, findings = likelihood.evidence, likelihood.findings
-        healthy = healthy_log_density(evidence, findings)[rows]
-        return RunLikelihood(evidence[rows], model, remembered=findings[rows], healthy=healthy)
 
     def _learn(self, evidence: SettledEvidence, movement: int, begin_s: float) -> None:
         """Learn from a movement that is over; what is known better counts from the next on.
@@ -273,6 +258,36 @@ class FaultMonitor(RobotStream):
         """Estimate by what the robot itself has taught."""
         self._fleet.adopt(self._models[-1].imperfections)
         self._models[-1] = self._fleet.model
+
+
+def candidates(known: HealthyModel) -> list[HealthyModel]:
+    """Return the candidates for the healthy behaviour of a robot that teaches nothing.
+
+    What is known of it, and what arms of its kind are like, where that is something else.
+    """
+    imperfections = known.imperfections
+    if imperfections.of_class or imperfections.settling is None:
+        return [known]
+    kind = generic_imperfections(known.twin.robot)
+    return [known, HealthyModel.of(known.twin, kind).seen_by(known.sensing)]
+
+
+def mixture_of(models: Sequence[HealthyModel], diagnoser: BayesDiagnoser) -> HealthyMixture:
+    """Return the filter of one candidate, or of two of which the second is another robot."""
+    hypotheses, priors = diagnoser.hypothesis_set, diagnoser.priors
+    filters = [FaultFilter(model, hypotheses, priors) for model in models]
+    share = [1.0] if len(filters) == 1 else [1.0 - FOREIGN, FOREIGN]
+    return HealthyMixture(filters, np.array(share))
+
+
+def part_of(likelihood: RunLikelihood, model: HealthyModel, part: slice) -> RunLikelihood:
+    """Return what some of the last movements say by a model."""
+    if model is not likelihood.model:
+        likelihood = RunLikelihood(likelihood.evidence, model)
+    rows = slice(None), part
+    evidence, findings = likelihood.evidence, likelihood.findings
+    healthy = healthy_log_density(evidence, findings)[rows]
+    return RunLikelihood(evidence[rows], model, remembered=findings[rows], healthy=healthy)
 
 
 def monitor(

@@ -96,7 +96,7 @@ class StreamRuns:
             self._reference = References.empty(run=1, motor=len(command))
         moved = self._reference.moved
         moves = bool(moved[0])
-        moved[self._reference.see(time, command[None])] = False
+        moved[self._reference.see(np.array([time]), command[None])] = False
         if self._reference.still[0] > 0:  # it does not turn
             return
         begins = bool(moved[0]) and not moves
@@ -211,13 +211,13 @@ class SetUpWatch:
             if motor not in self._blamed[-1:]:
                 self._blamed.append(motor)
         young = self.movements <= PROOF
-        eager = young and not _is_held(alarm.cause)
+        eager = young and not is_held(alarm.cause)
         again = self.movements if eager else AGAIN * self._asked_at
         self._proven = self._proven and not new
         if new or not (young or self._proven) or self._asked_at < self.movements >= again:
             self._ask(thorough=new or not young)
             self._proven = not young
-        if self.finding and not (_is_held(alarm.cause) and self._may_be_a_zero):
+        if self.finding and not (is_held(alarm.cause) and self._may_be_a_zero):
             return self.finding
         if len(self._blamed) > CHANGES:
             named = ", then ".join(motor.replace("_", " ") for motor in self._blamed)
@@ -225,7 +225,7 @@ class SetUpWatch:
                 f"the log does not fit the profile: the motor that is blamed changes ({named}), "
                 "and no mistake that is known explains it"
             )
-        if young and not _is_held(alarm.cause):
+        if young and not is_held(alarm.cause):
             fault = plain_name(Hypothesis.parse(alarm.cause))
             return f"{fault}, or the log does not fit the profile: a few movements more tell"
         return ""
@@ -265,7 +265,7 @@ class SetUpWatch:
         self._fitted |= best.fits and not best.set_up.what and self.movements >= PROOF
 
 
-def _is_held(cause: str) -> bool:
+def is_held(cause: str) -> bool:
     """Return whether a fault holds its motor, which no set-up does."""
     return all(
         MODES[fault.mode].signature is Signature.HELD for fault in Hypothesis.parse(cause).faults

@@ -59,11 +59,11 @@ class References(ArrayStruct):
     before_s: Annotated[FloatArray, Axes("run", empty=-np.inf)]
     left_s: Annotated[FloatArray, Axes("run", empty=-np.inf)]
 
-    def see(self, time: float, command: FloatArray) -> IntArray:
-        """Take references at a time and return the robots whose movements can be found now.
+    def see(self, time: FloatArray, command: FloatArray) -> IntArray:
+        """Take references and return the robots whose movements can be found now.
 
-        What comes late, older than what is known, says nothing new of them. References are (robot,
-        motor) [rad]; NaN where not known.
+        What comes late, older than what is known, says nothing new of them. Times are (robot,) [s],
+        references (robot, motor) [rad]; NaN where not known.
         """
         known = np.isfinite(command).all(axis=1) & (time > self.last_s)
         first = known & np.isnan(self.last[:, 0])
@@ -72,17 +72,19 @@ class References(ArrayStruct):
         leaves = turns & ~self.moved
         self.left_s[leaves], self.before_s[leaves] = self.last_s[leaves], self.rest_s[leaves]
         self.moved[turns] = True
-        self.rest_s[first | turns], self.stood[first | turns] = time, command[first | turns]
+        rests = first | turns
+        self.rest_s[rests], self.stood[rests] = time[rests], command[rests]
         self.still[turns] = 0
         self.still[known & ~turns & ~first] += 1
-        self.last[known], self.last_s[known] = command[known], time
+        self.last[known], self.last_s[known] = command[known], time[known]
         return np.flatnonzero(known & self.moved & (self.still >= STILL_STEPS))
 
     def movements(self, robot: int, samples: SampleBuffer) -> Movements:
         """Return what a robot was told to do since it was last at rest, as one run."""
         self.moved[robot] = False
-        some = samples.since(max(self.before_s[robot], self.left_s[robot] - PLATEAU_S))
-        time, command = samples.time[some], samples.command[some, robot]
+        begin = max(self.before_s[robot], self.left_s[robot] - PLATEAU_S)
+        some = samples.since(robot, begin)
+        time, command = samples.time(robot)[some], samples.command(robot)[some]
         known = np.isfinite(command).all(axis=1)
         if known.sum() < 2:  # all others are too old to be remembered
             return find_movements(self.last[None, [robot, robot]], GRID_S * np.arange(2.0))
@@ -123,12 +125,12 @@ class MovementTracker:
         self.window = self.window.looked_at_by(model)
 
     def take(
-        self, time: float, command: FloatArray, points: FloatArray, away: BoolArray
+        self, time: FloatArray, command: FloatArray, points: FloatArray, away: BoolArray
     ) -> tuple[IntArray, ...]:
-        """Take a sample.
+        """Take a sample of each robot.
 
         Args:
-            time: When it was taken [s].
+            time: When it was taken, (robot,) [s]; NaN: none of this robot.
             command: References, (robot, motor) [rad]; NaN where not known.
             points: Readings, the tool's position first, (robot, channel) [m]; NaN: there is none.
             away: Tools that have left where they rested though no command came, (robot,): where
@@ -143,7 +145,7 @@ class MovementTracker:
         for robot in begun:
             self.find_movements(int(robot))
         read = np.flatnonzero(np.isfinite(points).all(axis=1))
-        self.window.read_s[read] = np.maximum(self.window.read_s[read], time)
+        self.window.read_s[read] = np.maximum(self.window.read_s[read], time[read])
         return begun, self.look(read[~away[read]])
 
     def see_goals(self, goal: FloatArray) -> IntArray:
@@ -174,8 +176,8 @@ class MovementTracker:
         known = window.settled.usable[robots, last] & (window.count > 0) & ~self.references.moved
         return np.where(known[:, None], window.settled.point[robots, last, :3], np.nan)
 
-    def overdue(self, time: float) -> BoolArray:
-        """Return which arms must have come to rest by a time [s], however late, (robot,)."""
+    def overdue(self, time: FloatArray) -> BoolArray:
+        """Return which arms must have come to rest by a time, (robot,) [s], however late."""
         window = self.window
         robots, last = np.arange(len(window.count)), np.maximum(window.count - 1, 0)
         now = window.settled.movements[robots, last]
@@ -188,7 +190,7 @@ class MovementTracker:
         """Add the movements of a reference, up to now."""
         movements, window = self.references.movements(robot, self.samples), self.window
         if np.isnan(window.zero_s[robot]):
-            window.zero_s[robot] = self.samples.time[0]
+            window.zero_s[robot] = self.samples.time(robot)[0]
         for number, start in enumerate(movements.start[0]):
             if window.count[robot] > 0:
                 last = int(window.count[robot]) - 1
@@ -227,15 +229,15 @@ class MovementTracker:
         self._resume(robot, place)
         settled, at = self.window.settled, (robot, place)
         start, until = settled.movements.start[at], settled[at].transient_until
-        some = self.samples.since(float(start))
-        time, point = self.samples.time[some], self.samples.measured[some, robot]
+        some = self.samples.since(robot, float(start))
+        time, point = self.samples.time(robot)[some], self.samples.measured(robot)[some]
         there = np.isfinite(point).all(axis=1) & (time < until - 1e-9)
         self.window.transient.take_in(at, start, time[there], point[there], self._least_step)
 
     def spoil(self, robot: int, since_s: float) -> None:
         """Forget the readings of a robot since a time [s], and what they said of its movements."""
         settled = self.window.settled
-        self.samples.measured[self.samples.since(since_s), robot] = np.nan
+        self.samples.measured(robot)[self.samples.since(robot, since_s)] = np.nan
         for place in range(int(self.window.count[robot])):
             if settled.end[robot, place] > since_s:
                 at = np.array([robot]), np.array([place])
@@ -265,11 +267,9 @@ class MovementTracker:
     def _readings(
         self, robots: IntArray, begin: FloatArray, end: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return samples (robot, sample, channel) [m], their times (sample,) [s], which to take."""
-        some = self.samples.since(float(begin.min()) - 1e-9)
-        time = self.samples.time[some]
-        inside = (time >= begin[:, None] - 1e-9) & (time < end[:, None] - 1e-9)
-        return self.samples.measured[some, robots].swapaxes(0, 1), time, inside
+        """Return samples (robot, sample, channel) [m], their times [s], and which to take."""
+        samples, time = self.samples.readings_since(robots, begin - 1e-9)
+        return samples, time, time < end[:, None] - 1e-9
 
     def _under_way(self, at: Items) -> BoolArray:
         """Return which movements must still be on their way, as readings came back late."""
@@ -287,10 +287,10 @@ class MovementTracker:
         if np.isfinite(settled.first_reading_delay[robot, place]):
             return
         start = float(settled.movements.start[robot, place])
-        some = samples.since(start)
-        there = np.isfinite(samples.measured[some, robot]).all(axis=1)
+        some = samples.since(robot, start)
+        there = np.isfinite(samples.measured(robot)[some]).all(axis=1)
         if there.any():
-            first = samples.time[some][np.argmax(there)]
+            first = samples.time(robot)[some][np.argmax(there)]
             settled.first_reading_delay[robot, place] = first - start
 
     def _may_start_late(self, at: Items, point: FloatArray) -> BoolArray:
@@ -318,16 +318,19 @@ def _since_rest(
     """Return the readings from which on all are near the newest, (robot, sample).
 
     None where they span too short a time to tell rest from a slow start. Samples are (robot,
-    sample, axis) [m], NaN where there is none; those `inside`, (robot, sample), count.
+    sample, axis) [m], NaN where there is none, and their times (robot, sample) [s]; those `inside`,
+    (robot, sample), count.
     """
     there = inside & np.isfinite(samples).all(axis=-1)
     if not there.any():
         return there
     number = np.arange(samples.shape[1])
     newest = np.where(there, number, 0).max(axis=1)
-    off = samples - samples[np.arange(len(samples)), newest][:, None]
+    last = np.arange(len(samples)), newest
+    off = samples - samples[last][:, None]
     with np.errstate(invalid="ignore"):
         far = there & (np.linalg.norm(off, axis=-1) > same_place_m)
     kept = there & (number > np.where(far, number, -1).max(axis=1, keepdims=True))
     first = np.where(kept, time, np.inf).min(axis=1)
-    return kept & (time[newest] - first >= REST_S)[:, None]
+    newest_s = np.where(np.isfinite(first), time[last], -np.inf)
+    return kept & (newest_s - first >= REST_S)[:, None]

@@ -71,7 +71,7 @@ class FrozenSensorDetector(ArrayStruct):
 
     def see(
         self,
-        time: float,
+        time: FloatArray,
         read: BoolArray,
         points: FloatArray,
         command: FloatArray,
@@ -81,7 +81,7 @@ class FrozenSensorDetector(ArrayStruct):
         """Take readings and say what is dead.
 
         Args:
-            time: When they were taken [s].
+            time: When they were taken, (robot,) [s].
             read: Robots that were read, (robot,).
             points: Tool positions of all, (robot, axis) [m].
             command: References of all, as far as known, (robot, motor) [rad].
@@ -99,16 +99,17 @@ class FrozenSensorDetector(ArrayStruct):
             anew[:, 3] &= ~(np.abs(points - self.place).max(axis=1) <= near_m)
         self.number[anew[:, :3]], self.place[anew[:, 3]] = points[anew[:, :3]], points[anew[:, 3]]
         second = read[:, None] & ~anew & np.isposinf(self.since_s)
-        self.since_s[anew], self.since_s[second] = np.inf, time
+        at = np.broadcast_to(time[:, None], self.since_s.shape)
+        self.since_s[anew], self.since_s[second] = np.inf, at[second]
         reference = np.broadcast_to(command[:, None], self.low.shape)
         self.low[anew | second] = self.high[anew | second] = reference[anew | second]
         np.fmin(self.low, reference, out=self.low)
         np.fmax(self.high, reference, out=self.high)
         told = should_move(self.high - self.low)
-        self.told_s[:] = np.where(told, np.minimum(self.told_s, time), np.inf)
+        self.told_s[:] = np.where(told, np.fmin(self.told_s, at), np.inf)
         still_for = STILL_FOR_S if flickers else STILL_FOR_S.max()
         with np.errstate(invalid="ignore"):
-            still = (time - self.since_s >= still_for) & (time - self.told_s >= TOLD_FOR_S)
+            still = (at - self.since_s >= still_for) & (at - self.told_s >= TOLD_FOR_S)
         still &= read[:, None]
         dead = still[:, 3] | still[:, :3].all(axis=1)
         # One at zero may be held there by a stuck motor; see `log_quality`.
@@ -163,7 +164,7 @@ class UntoldMotion(ArrayStruct):
 
     def see(
         self,
-        time: float,
+        time: FloatArray,
         points: FloatArray,
         rest: FloatArray,
         told: BoolArray,
@@ -175,7 +176,7 @@ class UntoldMotion(ArrayStruct):
         """Take readings and return which tools are away from where they rested, (robot,).
 
         Args:
-            time: When they were taken [s].
+            time: When they were taken, (robot,) [s].
             points: Tool positions, (robot, axis) [m]; NaN where there is none.
             rest: Where tools came to rest after their last command, (robot, axis) [m]; NaN: they
                 may be on their way.
@@ -195,7 +196,7 @@ class UntoldMotion(ArrayStruct):
         with np.errstate(invalid="ignore"):
             stands = read & (np.linalg.norm(points - self.place, axis=1) <= same_place_m)
         anew = read & ~stands
-        self.place[anew], self.since_s[anew] = points[anew], time
+        self.place[anew], self.since_s[anew] = points[anew], time[anew]
         rested = stands & (~told | overdue) & np.isnan(self.rest[:, 0])
         rested &= time - self.since_s >= RESTED_S
         self.rest[rested] = self.place[rested]
@@ -208,10 +209,11 @@ class UntoldMotion(ArrayStruct):
         aim = told_place(left) if len(left) else points[left]
         off_before = np.linalg.norm(self.rest[left] - aim, axis=1)
         off = np.linalg.norm(points[left] - aim, axis=1)
-        halts = stands[left] & (time - self.since_s[left] >= RESTED_S) & (off > moved_m)
+        halts = stands[left] & (time[left] - self.since_s[left] >= RESTED_S) & (off > moved_m)
         away[left[(off_before > moved_m) & (off < off_before) & ~halts]] = False
         self.away_s[read & ~away] = np.nan
-        self.away_s[away & np.isnan(self.away_s)] = time
+        leaves = away & np.isnan(self.away_s)
+        self.away_s[leaves] = time[leaves]
         with np.errstate(invalid="ignore"):
             self.untold[time - self.away_s >= UNTOLD_S] = True
         return np.isfinite(self.away_s) | self.untold

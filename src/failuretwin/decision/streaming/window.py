@@ -135,91 +135,159 @@ class MovementWindow(ArrayStruct):
         return robots, slice(0, int(self.count[robots].max(initial=0)))
 
 
-# The samples of the last seconds, of all robots at once.
+# The samples of the last seconds, each robot by its own times.
 
 KEEP_S = 30.0
 """How long samples are kept [s]; movements that take longer are not found."""
 FIRST_ROOM = 64
-"""Samples that there is room for at first."""
+"""Samples of a robot that there is room for at first."""
+FULL, GROWTH = 0.75, 1.5
+"""Share of the room from which it grows when it is used up, and by what factor."""
 
 
 class SampleBuffer:
     """Commands and readings of the last seconds, in the order of their times."""
 
     def __init__(self, robots: int, motors: int, channels: int = 3) -> None:
-        self._first = self._stop = 0
-        self._time = np.empty(FIRST_ROOM)
-        self._command = np.empty((FIRST_ROOM, robots, motors))
-        self._measured = np.empty((FIRST_ROOM, robots, channels))
+        self._first = np.zeros(robots, dtype=np.int64)
+        self._stop = np.zeros(robots, dtype=np.int64)
+        self._time = np.full((robots, FIRST_ROOM), np.inf)
+        self._command = np.empty((robots, FIRST_ROOM, motors))
+        self._measured = np.empty((robots, FIRST_ROOM, channels))
 
-    @property
-    def time(self) -> FloatArray:
-        """Times, increasing, (sample,) [s]."""
-        return self._time[self._first : self._stop]
+    def time(self, robot: int) -> FloatArray:
+        """Return the times of a robot, increasing, (sample,) [s]."""
+        return self._time[robot, self._first[robot] : self._stop[robot]]
 
-    @property
-    def command(self) -> FloatArray:
-        """References, (sample, robot, motor) [rad]; NaN where not known."""
-        return self._command[self._first : self._stop]
+    def command(self, robot: int) -> FloatArray:
+        """Return its references, (sample, motor) [rad]; NaN where not known."""
+        return self._command[robot, self._first[robot] : self._stop[robot]]
 
-    @property
-    def measured(self) -> FloatArray:
-        """Readings, (sample, robot, channel) [m]; NaN where there is none."""
-        return self._measured[self._first : self._stop]
+    def measured(self, robot: int) -> FloatArray:
+        """Return its readings, (sample, channel) [m]; NaN where there is none."""
+        return self._measured[robot, self._first[robot] : self._stop[robot]]
 
-    def add(self, time: float, command: FloatArray, measured: FloatArray) -> None:
-        """Take a sample; one that comes late takes its place among the others.
+    def add(self, time: FloatArray, command: FloatArray, measured: FloatArray) -> None:
+        """Take a sample of each robot; one that comes late takes its place among the others.
 
-        References are (robot, motor) [rad], readings (robot, channel) [m]; NaN where there is none.
+        Times are (robot,) [s], NaN: none of this robot; references (robot, motor) [rad], readings
+        (robot, channel) [m], NaN where there is none.
         """
-        self._make_room()
-        at = self._stop
-        if len(self.time) and time <= self.time[-1]:
-            at = self._first + int(np.searchsorted(self.time, time))
-            if self._time[at] == time:
-                _fill(self._command[at], command)
-                _fill(self._measured[at], measured)
-                return
-            for values in (self._time, self._command, self._measured):
-                values[at + 1 : self._stop + 1] = values[at : self._stop].copy()
-        self._time[at], self._command[at], self._measured[at] = time, command, measured
-        self._stop += 1
-        oldest = self.time[-1] - KEEP_S
-        while self._time[self._first] < oldest:
-            self._first += 1
+        rows = np.flatnonzero(np.isfinite(time))
+        if len(rows) == 0:
+            return
+        self._make_room(rows)
+        stop = self._stop[rows]
+        newest = np.where(stop > self._first[rows], self._time[rows, stop - 1], -np.inf)
+        late = time[rows] <= newest
+        for robot in rows[late].tolist():
+            self._insert(robot, float(time[robot]), command[robot], measured[robot])
+        new, at = rows[~late], stop[~late]
+        self._time[new, at] = time[new]
+        self._command[new, at], self._measured[new, at] = command[new], measured[new]
+        self._stop[new] += 1
+        oldest = self._time[rows, self._stop[rows] - 1] - KEEP_S
+        while (old := self._time[rows, self._first[rows]] < oldest).any():
+            self._first[rows[old]] += 1
 
-    def since(self, time: float) -> slice:
-        """Return the samples that are no older than a time [s]."""
-        return slice(int(np.searchsorted(self.time, time)), len(self.time))
+    def _insert(self, robot: int, time: float, command: FloatArray, measured: FloatArray) -> None:
+        """Take a sample of one robot that is no newer than its newest."""
+        known = self.time(robot)
+        at = int(self._first[robot]) + int(np.searchsorted(known, time))
+        if self._time[robot, at] == time:
+            _fill(self._command[robot, at], command)
+            _fill(self._measured[robot, at], measured)
+            return
+        stop = int(self._stop[robot])
+        for values, value in (
+            (self._time, time),
+            (self._command, command),
+            (self._measured, measured),
+        ):
+            values[robot, at + 1 : stop + 1] = values[robot, at:stop].copy()
+            values[robot, at] = value
+        self._stop[robot] += 1
+
+    def since(self, robot: int, time: float) -> slice:
+        """Return the samples of a robot that are no older than a time [s]."""
+        known = self.time(robot)
+        return slice(int(np.searchsorted(known, time)), len(known))
+
+    def readings_since(self, robots: IntArray, time: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return readings of some robots, each since a time, (robot,) [s].
+
+        Returns:
+            Readings (robot, sample, channel) [m] and their times (robot, sample) [s]; behind the
+            last of a robot NaN and inf.
+        """
+        known = [self.since(robot, at) for robot, at in zip(robots.tolist(), time, strict=True)]
+        begin = self._first[robots] + np.array([one.start for one in known], dtype=np.int64)
+        count = np.array([one.stop - one.start for one in known], dtype=np.int64)
+        place = np.arange(count.max(initial=0))
+        there = place < count[:, None]
+        at = robots[:, None], np.where(there, begin[:, None] + place, 0)
+        measured = np.where(there[..., None], self._measured[at], np.nan)
+        return measured, np.where(there, self._time[at], np.inf)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return all samples, by name."""
+        """Return all samples, by name; behind the last of a robot times are inf."""
+        robots = np.arange(len(self._first))
+        count = self._stop - self._first
+        place = np.arange(count.max(initial=0))
+        there = place < count[:, None]
+        at = robots[:, None], np.where(there, self._first[:, None] + place, 0)
         return {
-            "samples/time": self.time,
-            "samples/command": self.command,
-            "samples/measured": self.measured,
+            "samples/time": np.where(there, self._time[at], np.inf),
+            "samples/command": np.where(there[..., None], self._command[at], np.nan),
+            "samples/measured": np.where(there[..., None], self._measured[at], np.nan),
         }
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Take over the samples of another stream, in the order of their times."""
-        named = (state[name] for name in self.state())
-        for time, command, measured in zip(*named, strict=True):
-            self.add(float(time), command, measured)
+        """Take over the samples of another stream.
 
-    def _make_room(self) -> None:
-        if self._stop < len(self._time):
+        Raises:
+            KeyError: If something is missing.
+            ValueError: If something is of another shape.
+        """
+        time, command, measured = (state[f"samples/{what}"] for what in SAMPLED)
+        robots, count = time.shape
+        shapes = [(robots, count, self._command.shape[2]), (robots, count, self._measured.shape[2])]
+        if robots > len(self._first) or [command.shape, measured.shape] != shapes:
+            raise ValueError(f"samples have shapes {command.shape}, {measured.shape}")
+        self._first[:], self._stop[:] = 0, 0
+        self._resize(max(FIRST_ROOM, count))
+        self._stop[:robots] = np.isfinite(time).sum(axis=1)
+        self._time[:robots, :count] = time
+        self._command[:robots, :count], self._measured[:robots, :count] = command, measured
+
+    def _make_room(self, rows: IntArray) -> None:
+        room = self._time.shape[1]
+        if int(self._stop[rows].max()) < room:
             return
+        count = int((self._stop - self._first).max())
+        self._resize(int(GROWTH * room) if count > FULL * room else room)
+
+    def _resize(self, room: int) -> None:
+        """Move the samples of every robot to the begin of a room of another size."""
         count = self._stop - self._first
-        room = 2 * len(self._time) if count > len(self._time) // 2 else len(self._time)
+        place = np.arange(int(count.max(initial=0)))
+        at = (
+            np.arange(len(count))[:, None],
+            np.minimum(self._first[:, None] + place, self._time.shape[1] - 1),
+        )
         for name in ("_time", "_command", "_measured"):
             old = getattr(self, name)
-            new = np.empty((room, *old.shape[1:]))
-            new[:count] = old[self._first : self._stop]
+            new = np.empty((len(old), room, *old.shape[2:]))
+            new[:, : len(place)] = old[at]
             setattr(self, name, new)
-        self._first, self._stop = 0, count
+        self._first[:], self._stop[:] = 0, count
+
+
+SAMPLED = ("time", "command", "measured")
+"""What a sample holds."""
 
 
 def _fill(old: FloatArray, new: FloatArray) -> None:
-    """Replace the values of robots (robot, ...) of which something new is known, in place."""
-    known = np.isfinite(new).all(axis=-1)
-    old[known] = new[known]
+    """Replace the values of one robot, in place, if something new is known of it."""
+    if np.isfinite(new).all():
+        old[:] = new

@@ -1,0 +1,1 @@
+"""Messages of a fleet of robots, the broker that carries them, and the bridge that fills it."""

@@ -1,0 +1,242 @@
+"""The broker of a fleet: NATS with JetStream, its subjects, streams and buckets.
+
+| subject | content |
+|---|---|
+| ``fleet.in.ROBOT.profile``, ``fleet.in.ROBOT.events`` | what robots say (MQTT: ``fleet/in/...``) |
+| ``fleet.p.N.ROBOT.KIND`` | the same, by partition: the server maps it (`server_config`) |
+| ``fleet.alarm.ROBOT.LIFE.EPISODE.STATE`` | an alarm that was raised or cleared, stored once |
+| ``fleet.health.ROBOT`` | state of a robot, when it changes |
+
+What a snapshot covers is removed from the stream of events. A stream that is full refuses what
+comes: publishers are told, and nothing that was accepted is dropped.
+
+Section: docs/fleet.md
+"""
+
+from __future__ import annotations
+
+import ssl
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from failuretwin.core.errors import InputError, needs_extra
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+    from nats.js.client import JetStreamContext
+    from nats.js.kv import KeyValue
+    from nats.js.object_store import ObjectStore
+
+PARTITIONS = 8
+"""Partitions of a fleet by default; the mapping of the server must say the same."""
+IN, BY_PARTITION, ALARM, HEALTH = "fleet.in", "fleet.p", "fleet.alarm", "fleet.health"
+EVENTS_STREAM, ALARM_STREAM = "FLEET_EVENTS", "FLEET_ALARMS"
+LEASES, WORKERS, SNAPSHOTS, HEALTH_BUCKET, PROFILES = (
+    "fleet_leases",
+    "fleet_workers",
+    "fleet_snapshots",
+    "fleet_health",
+    "fleet_profiles",
+)
+"""Buckets: who holds a partition, who works, the last snapshots, health by partition, profiles."""
+STATES = "fleet_states"
+"""Object store of the snapshots themselves."""
+LEASE_S = 6.0
+"""Time without renewal after which a partition is free [s]."""
+LARGEST_STREAM = 2 * 1024**3
+"""Room for events that no snapshot covers [bytes]."""
+ALARMS_KEPT_S = 90 * 86_400.0
+"""Time for which alarms are kept [s]."""
+TRIES_S = 2.0
+"""Time between two tries to reach a server that is gone [s]."""
+
+
+@dataclass(frozen=True)
+class Access:
+    """How to reach a server.
+
+    Attributes:
+        url: ``nats://[USER:PASSWORD@]HOST[:PORT]``, or ``tls://...``.
+        ca: File of the authority that signs the server's certificate; None: those of the system.
+        certificate: Our certificate and key in one file; None: the server asks for none.
+        nkey: File with the seed of an NKey; None: none.
+    """
+
+    url: str
+    ca: Path | None = None
+    certificate: Path | None = None
+    nkey: Path | None = None
+
+    def __post_init__(self) -> None:
+        parts = urlsplit(self.url)
+        if parts.scheme not in ("nats", "tls") or not parts.hostname:
+            raise InputError(
+                f"fleet server {self.url!r}: expected nats://HOST[:PORT] or tls://HOST[:PORT]."
+            )
+
+    @property
+    def shown(self) -> str:
+        """The address without a password."""
+        parts = urlsplit(self.url)
+        return f"{parts.scheme}://{parts.hostname}:{parts.port or 4222}"
+
+    @property
+    def context(self) -> ssl.SSLContext | None:
+        """TLS settings; None: not encrypted."""
+        if urlsplit(self.url).scheme != "tls" and self.ca is None:
+            return None
+        try:
+            found = ssl.create_default_context(cafile=self.ca)
+            if self.certificate is not None:
+                found.load_cert_chain(self.certificate)
+        except (OSError, ssl.SSLError) as error:
+            raise InputError(f"TLS files of the fleet cannot be read: {error}.") from error
+        return found
+
+
+class Broker:
+    """A connection to the server; `open_broker` returns one.
+
+    Attributes:
+        client: The connection.
+        stream: Its JetStream.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+        self.stream: JetStreamContext = client.jetstream(timeout=5.0)
+
+    async def bucket(self, name: str, **settings: Any) -> KeyValue:
+        """Return a bucket, made if it is new."""
+        from nats.js.errors import BucketNotFoundError
+
+        try:
+            return await self.stream.key_value(name)
+        except BucketNotFoundError:
+            return await self.stream.create_key_value(bucket=name, history=1, **settings)
+
+    async def states(self) -> ObjectStore:
+        """Return the store of snapshots, made if it is new."""
+        from nats.js.errors import BucketNotFoundError, NotFoundError
+
+        try:
+            return await self.stream.object_store(STATES)
+        except (BucketNotFoundError, NotFoundError):
+            return await self.stream.create_object_store(STATES)
+
+    async def set_up(self) -> None:
+        """Make the streams that are missing."""
+        from nats.js.api import DiscardPolicy, StreamConfig
+
+        once = StreamConfig(
+            name=ALARM_STREAM,
+            subjects=[f"{ALARM}.>"],
+            max_msgs_per_subject=1,
+            discard=DiscardPolicy.NEW,
+            discard_new_per_subject=True,
+            max_age=ALARMS_KEPT_S,
+        )
+        events = StreamConfig(
+            name=EVENTS_STREAM,
+            subjects=[f"{BY_PARTITION}.>"],
+            discard=DiscardPolicy.NEW,
+            max_bytes=LARGEST_STREAM,
+        )
+        for wanted in (events, once):
+            await self._make(wanted)
+
+    async def _make(self, wanted: Any) -> None:
+        from nats.js.errors import NotFoundError
+
+        try:
+            await self.stream.stream_info(wanted.name)
+        except NotFoundError:
+            await self.stream.add_stream(wanted)
+
+    async def close(self) -> None:
+        """Send what waits, then leave."""
+        from nats.errors import Error
+
+        with suppress(Error, OSError, TimeoutError):
+            await self.client.flush(timeout=2)
+        await self.client.close()
+
+    async def publish_once(self, subject: str, data: bytes) -> bool:
+        """Store a message unless its subject has one, and return whether it is new."""
+        from nats.js.errors import APIError
+
+        try:
+            await self.stream.publish(subject, data)
+        except APIError as error:
+            if error.err_code == PER_SUBJECT:
+                return False
+            raise
+        return True
+
+
+PER_SUBJECT = 10077
+"""Error code of a stream whose subject holds a message already."""
+
+
+async def open_broker(access: Access, name: str) -> Broker:
+    """Return a connection that comes back by itself when the server was away.
+
+    Args:
+        access: The server.
+        name: Our name there.
+
+    Raises:
+        InputError: If the server does not answer, or refuses us.
+    """
+    with needs_extra("a fleet needs nats-py", "fleet"):
+        import nats
+        from nats.errors import Error
+    options: dict[str, Any] = {}
+    if access.nkey is not None:
+        options["nkeys_seed"] = str(access.nkey)
+    if access.context is not None:
+        options["tls"] = access.context
+    seen: list[Exception] = []
+
+    async def note(error: Exception) -> None:
+        seen.append(error)
+
+    try:
+        client = await nats.connect(
+            access.url,
+            name=name,
+            error_cb=note,
+            connect_timeout=5,
+            reconnect_time_wait=TRIES_S,
+            max_reconnect_attempts=-1,
+            allow_reconnect=False,
+            **options,
+        )
+    except (Error, OSError, TimeoutError) as error:
+        raise InputError(
+            f"fleet server {access.shown}: {seen[-1] if seen else error}. Expected a NATS server "
+            "with JetStream that lets us in; see docs/fleet.md."
+        ) from error
+    client.options["allow_reconnect"] = True  # it has let us in once
+    return Broker(client)
+
+
+def server_config(port: int, mqtt_port: int, folder: Path, partitions: int = PARTITIONS) -> str:
+    """Return the configuration of a server on this computer alone, without users."""
+    return f"""\
+host: 127.0.0.1
+port: {port}
+server_name: fleet
+jetstream {{ store_dir: "{folder}" }}
+mqtt {{ host: 127.0.0.1, port: {mqtt_port} }}
+mappings = {{ {mapping(partitions)} }}
+"""
+
+
+def mapping(partitions: int = PARTITIONS) -> str:
+    """Return the line of a server's `mappings` that spreads robots over partitions by name."""
+    to = f"{BY_PARTITION}.{{{{partition({partitions},1)}}}}.{{{{wildcard(1)}}}}.{{{{wildcard(2)}}}}"
+    return f'"{IN}.*.*": "{to}"'

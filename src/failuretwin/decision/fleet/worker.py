@@ -1,0 +1,567 @@
+"""A worker: holds partitions by leases, filters their robots, and keeps snapshots of them.
+
+Whoever holds the lease of a partition goes on from its last snapshot and replays what came after
+it. Its alarms are the same again, and the server stores each once. A lease that is not renewed
+ends by the clock of the server, so clocks of workers do not matter. A worker that was paused finds
+its lease gone when it goes on; what it still says is known already.
+
+Section: docs/fleet.md#workers
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import time
+import uuid
+from collections.abc import Awaitable, Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from failuretwin.connection.fleet import broker as names
+from failuretwin.connection.fleet.broker import Broker
+from failuretwin.connection.fleet.messages import ProfileMessage, parse_profile
+from failuretwin.core.errors import InputError, counted
+from failuretwin.decision.fleet.metrics import Metrics
+from failuretwin.decision.fleet.partition import PROFILE, AlarmChange, Envelope, Partition, Resolve
+
+if TYPE_CHECKING:
+    from nats.aio.msg import Msg
+    from nats.js.client import JetStreamContext
+    from nats.js.kv import KeyValue
+    from nats.js.object_store import ObjectStore
+
+T = TypeVar("T")
+RENEW_S = 1.5
+"""Time between two looks at the leases [s]; a quarter of `LEASE_S`."""
+CYCLE_S = 0.5
+"""Least time between two fetches [s], so that many robots are judged together."""
+FETCH, FETCH_S = 4000, 1.0
+"""Messages that are fetched at once at most, and how long to wait for the first [s]."""
+HEALTH_S = 2.0
+"""Time between two reports of health [s]."""
+SILENCE_S = 10.0
+"""Time without a message after which a robot is stale [s]."""
+BEHIND_S = 10.0
+"""Delay from which a worker says that it cannot follow [s]."""
+STALE = "stale"
+
+
+ABANDON_S = 5.0
+"""Longest wait for work that is abandoned [s]."""
+
+
+class LeaseLostError(Exception):
+    """Somebody else holds the partition by now."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a worker works.
+
+    Attributes:
+        name: Its name, one of its own.
+        partitions: Partitions of the fleet, as the mapping of the server says.
+        snapshot_s: Time between two snapshots of a partition [s].
+        budget: False alarms in 100 hours that are allowed of each robot.
+    """
+
+    name: str
+    partitions: int = names.PARTITIONS
+    snapshot_s: float = 30.0
+    budget: float = 1.0
+
+
+@dataclass
+class Outlets:
+    """Where a worker says what it finds, besides the server.
+
+    Attributes:
+        tell: Takes a line for the user.
+        retain: Takes a topic and a message that MQTT clients get when they come; None: nobody.
+        metrics: Figures of the worker.
+    """
+
+    tell: Callable[[str], None]
+    metrics: Metrics
+    retain: Callable[[str, bytes], None] | None = None
+
+
+@dataclass
+class Buckets:
+    """Buckets of the fleet."""
+
+    leases: KeyValue
+    workers: KeyValue
+    snapshots: KeyValue
+    health: KeyValue
+    profiles: KeyValue
+    states: ObjectStore
+
+    @classmethod
+    async def of(cls, broker: Broker) -> Buckets:
+        """Return the buckets of a server, made where they are missing."""
+        return cls(
+            await broker.bucket(names.LEASES, ttl=names.LEASE_S),
+            await broker.bucket(names.WORKERS, ttl=names.LEASE_S),
+            await broker.bucket(names.SNAPSHOTS),
+            await broker.bucket(names.HEALTH_BUCKET),
+            await broker.bucket(names.PROFILES),
+            await broker.states(),
+        )
+
+
+class Worker:
+    """One worker; `run` works until it is stopped.
+
+    Args:
+        broker: The server.
+        settings: How it works.
+        resolve: Finds the method for a profile.
+        outlets: Where it says what it finds.
+    """
+
+    def __init__(
+        self, broker: Broker, settings: Settings, resolve: Resolve, outlets: Outlets
+    ) -> None:
+        self.broker, self.settings, self.resolve = broker, settings, resolve
+        self.outlets = outlets
+        self.buckets: Buckets
+        self._held: dict[int, _Holder] = {}
+        self._computer = ThreadPoolExecutor(1, "filter")
+        self._trouble = ""
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Work until `stop` is set, then hand everything over."""
+        await self.broker.set_up()
+        self.buckets = await Buckets.of(self.broker)
+        while not stop.is_set():
+            await self._look()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(stop.wait(), RENEW_S)
+        for holder in list(self._held.values()):
+            await self._release(holder)
+        with suppress(Exception):
+            await self.buckets.workers.delete(self.settings.name)
+        self._computer.shutdown()
+
+    async def compute(self, work: Callable[..., T], *values: Any) -> T:
+        """Return the result of work in the one thread for it."""
+        return await asyncio.get_running_loop().run_in_executor(self._computer, work, *values)
+
+    async def _look(self) -> None:
+        """Renew what is held, take what is free and due to us, give what is too much."""
+        from nats.errors import Error
+
+        try:
+            await self._renew()
+            await self._balance()
+        except (Error, OSError, TimeoutError) as error:
+            if not self._trouble:
+                self._trouble = f"the server does not answer ({type(error).__name__}); trying again"
+                self.outlets.tell(self._trouble)
+            return
+        if self._trouble:
+            self._trouble = ""
+            self.outlets.tell("the server answers again")
+
+    async def _renew(self) -> None:
+        from nats.js.errors import KeyWrongLastSequenceError
+
+        own = self.settings.name.encode()
+        for holder in list(self._held.values()):
+            try:
+                number = await self.buckets.leases.update(holder.key, own, last=holder.lease)
+                holder.lease, holder.renewed_s = number, time.monotonic()
+            except KeyWrongLastSequenceError:
+                await self._drop(holder, "another worker has it")
+            except Exception:
+                if time.monotonic() - holder.renewed_s > names.LEASE_S:
+                    await self._drop(holder, "its lease could not be renewed")
+                raise
+            if holder.task.done():
+                await self._drop(holder, "its work failed")
+
+    async def _balance(self) -> None:
+        table = {"partitions": sorted(self._held), "at": time.time()}
+        await self.buckets.workers.put(self.settings.name, json.dumps(table).encode())
+        alive = len(await _keys(self.buckets.workers))
+        due = math.ceil(self.settings.partitions / max(alive, 1))
+        self.outlets.metrics.workers.set(alive)
+        if len(self._held) > due:
+            await self._release(max(self._held.values(), key=lambda one: one.number))
+        elif len(self._held) < due:
+            await self._take(due - len(self._held))
+
+    async def _take(self, most: int) -> None:
+        """Take partitions that nobody holds."""
+        from nats.js.errors import KeyWrongLastSequenceError
+
+        taken = await _keys(self.buckets.leases)
+        free = [k for k in range(self.settings.partitions) if f"p{k}" not in taken]
+        for number in free[:most]:
+            try:
+                lease = await self.buckets.leases.create(f"p{number}", self.settings.name.encode())
+            except KeyWrongLastSequenceError:  # somebody was faster
+                continue
+            self._held[number] = _Holder(self, number, lease)
+            self.outlets.metrics.partitions.set(len(self._held))
+
+    async def _release(self, holder: _Holder) -> None:
+        """Hand a partition over with a snapshot of it."""
+        with suppress(Exception):
+            await asyncio.wait_for(holder.finish(), 60.0)
+        with suppress(Exception):
+            await self.buckets.leases.delete(holder.key, last=holder.lease)
+        await self._drop(holder, "")
+
+    async def _drop(self, holder: _Holder, why: str) -> None:
+        self._held.pop(holder.number, None)
+        self.outlets.metrics.partitions.set(len(self._held))
+        await holder.abandon()
+        self.outlets.metrics.forget(holder.key)
+        if why:
+            self.outlets.tell(f"partition {holder.number} is given up: {why}")
+
+
+async def _keys(bucket: KeyValue) -> set[str]:
+    from nats.js.errors import NoKeysError
+
+    try:
+        return set(await bucket.keys())
+    except NoKeysError:
+        return set()
+
+
+@dataclass
+class _Reported:
+    """What was last reported of a partition."""
+
+    at_s: float = -math.inf
+    states: dict[str, tuple[str, str]] = field(default_factory=dict)
+    behind: bool = False
+
+
+class _Holder:
+    """Work on one partition while its lease is held."""
+
+    def __init__(self, worker: Worker, number: int, lease: int) -> None:
+        self.number, self.key, self.lease = number, f"p{number}", lease
+        self.renewed_s = time.monotonic()
+        self._worker = worker
+        self._subject = f"{names.BY_PARTITION}.{number}.>"
+        self._stop = asyncio.Event()
+        self._pointer = 0
+        self._object = ""
+        self._expected = 0
+        self._last_message: Msg | None = None
+        self._saved_s, self._saved = time.monotonic(), 0
+        self._skew_s = math.inf
+        self._pending, self._taken = 0, 0
+        self._reported = _Reported()
+        self._careful = self._abandoned = False
+        self._source: JetStreamContext.PullSubscription | None = None
+        self._partition: Partition
+        self.task = asyncio.create_task(self._run())
+
+    async def finish(self) -> None:
+        """End the work with a snapshot."""
+        self._stop.set()
+        await self.task
+
+    async def abandon(self) -> None:
+        """End the work at once, without a snapshot."""
+        self._abandoned = True
+        self._stop.set()
+        self.task.cancel()
+        await asyncio.wait({self.task}, timeout=ABANDON_S)
+        if self.task.done() and not self.task.cancelled():
+            self.task.exception()  # was told
+
+    async def _run(self) -> None:
+        try:
+            await self._begin()
+            while not self._stop.is_set():
+                begun_s = time.monotonic()
+                full = await self._step()
+                await self._report()
+                if time.monotonic() - self._saved_s > self._worker.settings.snapshot_s:
+                    await self._save()
+                if not full:
+                    await asyncio.sleep(max(0.0, CYCLE_S - (time.monotonic() - begun_s)))
+            if not self._abandoned:
+                await self._save()
+        except Exception as error:
+            self._worker.outlets.tell(f"partition {self.number}: {_short(error)}")
+            raise
+        finally:
+            await self._close()
+
+    async def _begin(self) -> None:
+        """Go on from the last snapshot, or begin anew with the profiles that are known."""
+        begun_s = time.monotonic()
+        worker = self._worker
+        await self._patiently(self._load)
+        took = time.monotonic() - begun_s
+        worker.outlets.metrics.taken_over.inc()
+        robots = counted(len(self._partition.announced), "robot")
+        worker.outlets.tell(
+            f"partition {self.number}: {robots}, from message {self._partition.last}, {took:.1f} s"
+        )
+
+    async def _load(self) -> None:
+        from nats.js.errors import KeyNotFoundError
+
+        buckets, settings = self._worker.buckets, self._worker.settings
+        try:
+            entry = await buckets.snapshots.get(self.key)
+        except KeyNotFoundError:
+            announced = await self._announced()
+            self._partition = Partition(self._worker.resolve, settings.budget, announced)
+            return
+        self._pointer = entry.revision or 0
+        self._object = json.loads(entry.value or b"{}")["object"]
+        data = (await buckets.states.get(self._object)).data or b""
+        self._partition = await self._worker.compute(
+            Partition.restored, data, self._worker.resolve, settings.budget
+        )
+
+    async def _announced(self) -> dict[str, ProfileMessage]:
+        """Return the profiles that are known of all robots."""
+        found = {}
+        for name in await _keys(self._worker.buckets.profiles):
+            entry = await self._worker.buckets.profiles.get(name)
+            with suppress(InputError):
+                found[name] = parse_profile(entry.value or b"")
+        return found
+
+    async def _open(self) -> JetStreamContext.PullSubscription:
+        """Return a source of the messages that come after the last one taken."""
+        from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
+
+        stream, name = self._worker.broker.stream, f"{self.key}_{uuid.uuid4().hex[:8]}"
+        await stream.add_consumer(
+            names.EVENTS_STREAM,
+            ConsumerConfig(
+                durable_name=name,
+                deliver_policy=DeliverPolicy.BY_START_SEQUENCE,
+                opt_start_seq=self._partition.last + 1,
+                ack_policy=AckPolicy.ALL,
+                ack_wait=3600.0,
+                max_ack_pending=-1,
+                filter_subject=self._subject,
+                inactive_threshold=60.0,
+            ),
+        )
+        self._expected = 1
+        return await stream.pull_subscribe_bind(consumer=name, stream=names.EVENTS_STREAM)
+
+    async def _close(self) -> None:
+        """Leave the source; the server forgets it."""
+        source, self._source = self._source, None
+        if source is not None:
+            with suppress(Exception):
+                await source.unsubscribe()
+
+    async def _step(self) -> bool:
+        """Take what has come, and return whether there may be more at once."""
+        from nats.errors import Error
+
+        try:
+            self._source = self._source or await self._open()
+            messages = await self._source.fetch(1 if self._careful else FETCH, timeout=FETCH_S)
+        except TimeoutError:
+            self._pending = 0
+            return False
+        except (Error, OSError):
+            await self._close()
+            return False
+        envelopes, whole = self._envelopes(messages)
+        await self._take(envelopes)
+        if not whole:  # some were lost on the way: ask for them again
+            await self._close()
+        return len(messages) >= FETCH
+
+    def _envelopes(self, messages: list[Msg]) -> tuple[list[Envelope], bool]:
+        """Return messages in their order, up to a gap, and whether there was none."""
+        found, now = list[Envelope](), time.time()
+        for one in messages:
+            tokens = one.reply.split(".")
+            at = 5 if len(tokens) == TOKENS else 7
+            number, delivery, stamp, pending = map(int, tokens[at : at + 4])
+            if delivery != self._expected:
+                return found, False
+            self._expected += 1
+            self._pending, self._last_message = pending, one
+            server_s = 1e-9 * stamp
+            self._skew_s = min(self._skew_s, now - server_s)
+            robot, kind = one.subject.split(".", 4)[3:]
+            found.append(Envelope(number, server_s, robot, kind, one.data))
+        return found, True
+
+    async def _take(self, envelopes: list[Envelope]) -> None:
+        """Filter messages, then say what has changed."""
+        if not envelopes:
+            return
+        for one in envelopes:
+            if one.kind == PROFILE:
+                with suppress(InputError):
+                    parse_profile(one.data)
+                    await self._patiently(self._worker.buckets.profiles.put, one.robot, one.data)
+        try:
+            changes = await self._worker.compute(self._partition.take, envelopes)
+        except Exception as error:  # a message that breaks the filter must end no worker
+            await self._refuse(envelopes, error)
+            return
+        self._taken += len(envelopes)
+        self._worker.outlets.metrics.messages.inc(len(envelopes))
+        for change in changes:
+            await self._patiently(self._tell, change)
+
+    async def _refuse(self, envelopes: list[Envelope], error: Exception) -> None:
+        """Go back to the snapshot; message by message, until the robot behind it is known."""
+        refused = set(self._partition.refused)
+        if len(envelopes) == 1:
+            refused.add(envelopes[0].robot)
+        self._worker.outlets.tell(f"partition {self.number}: {_short(error)}; going back")
+        self._careful = len(envelopes) > 1
+        await self._patiently(self._load)
+        self._partition.refused |= refused
+        await self._close()
+
+    async def _tell(self, change: AlarmChange) -> None:
+        """Store a change of an alarm; one that was stored before is not new."""
+        data = json.dumps(asdict(change)).encode()
+        subject = f"{names.ALARM}.{change.identity}"
+        if not await self._worker.broker.publish_once(subject, data):
+            return
+        outlets = self._worker.outlets
+        outlets.metrics.alarms.labels(change.state).inc()
+        outlets.tell(f"{change.robot}: {change.state}: {change.cause} (episode {change.episode})")
+        if outlets.retain is not None:
+            outlets.retain(f"fleet/alarm/{change.robot}", data)
+
+    async def _patiently(self, work: Callable[..., Awaitable[T]], *values: Any) -> T:
+        """Return the result of work with the server, tried until it answers.
+
+        Raises:
+            LeaseLostError: If the lease has ended meanwhile.
+        """
+        from nats.errors import Error
+
+        while True:
+            try:
+                return await work(*values)
+            except (Error, OSError, TimeoutError):
+                if time.monotonic() - self.renewed_s > 2.0 * names.LEASE_S:
+                    raise LeaseLostError(f"partition {self.number}") from None
+                await asyncio.sleep(0.5)
+
+    async def _save(self) -> None:
+        """Store a snapshot, and let the server forget the messages that it covers."""
+        from nats.errors import Error
+
+        begun_s, last = time.monotonic(), self._partition.last
+        self._saved_s = begun_s
+        if last == self._saved:
+            return
+        data = await self._worker.compute(self._partition.snapshot)
+        try:
+            await self._store(data, last)
+        except (Error, OSError, TimeoutError) as error:
+            said = f"partition {self.number}: no snapshot ({_short(error)}); trying again"
+            self._worker.outlets.tell(said)
+            return
+        self._saved = last
+        metrics = self._worker.outlets.metrics
+        metrics.snapshot_bytes.labels(self.key).set(len(data))
+        metrics.snapshot_seconds.observe(time.monotonic() - begun_s)
+
+    async def _store(self, data: bytes, last: int) -> None:
+        from nats.js.errors import KeyWrongLastSequenceError, NotFoundError
+
+        buckets, stream = self._worker.buckets, self._worker.broker.stream
+        name, old = f"{self.key}-{last}-{uuid.uuid4().hex[:8]}", self._object
+        await buckets.states.put(name, data)
+        pointer = json.dumps({"object": name, "last": last}).encode()
+        # Only who has written the last pointer, or read it when taking over, may replace it.
+        try:
+            self._pointer = await buckets.snapshots.update(self.key, pointer, last=self._pointer)
+        except KeyWrongLastSequenceError:
+            await buckets.states.delete(name)
+            entry = await buckets.snapshots.get(self.key)
+            if json.loads(entry.value or b"{}")["last"] > last:  # we were paused for long
+                raise LeaseLostError(f"partition {self.number} has gone on without us") from None
+            self._pointer = entry.revision or 0  # the other was
+            raise
+        self._object = name
+        if old:
+            with suppress(NotFoundError):
+                await buckets.states.delete(old)
+        message, self._last_message = self._last_message, None
+        if message is not None:
+            await message.ack()
+        await stream.purge_stream(names.EVENTS_STREAM, subject=self._subject, seq=last + 1)
+
+    async def _report(self) -> None:
+        """Publish health and lag now and then; robots whose state changes by themselves."""
+        now_s, before = time.monotonic(), self._reported
+        if now_s - before.at_s < HEALTH_S:
+            return
+        server_now = time.time() - self._skew_s if math.isfinite(self._skew_s) else time.time()
+        robots = self._partition.health()
+        for table in robots.values():
+            if server_now - table["heard"] > SILENCE_S and self._pending == 0:
+                table["state"] = STALE
+        heard = max((table["heard"] for table in robots.values()), default=server_now)
+        lag_s = max(0.0, server_now - heard) if self._pending else 0.0
+        rate = self._taken / (now_s - before.at_s) if math.isfinite(before.at_s) else 0.0
+        report = {
+            "worker": self._worker.settings.name,
+            "at": time.time(),
+            "robots": robots,
+            "counts": dict(self._partition.counts),
+            "pending": self._pending,
+            "lag_s": round(lag_s, 3),
+            "messages_per_s": round(rate, 1),
+        }
+        self._taken = 0
+        states = {name: (one["state"], one["cause"]) for name, one in robots.items()}
+        changed = {
+            name: robots[name] for name, now in states.items() if before.states.get(name) != now
+        }
+        behind = lag_s > BEHIND_S
+        if behind != before.behind:
+            said = f"cannot follow: {self._pending} messages, {lag_s:.0f} s behind; nothing is lost"
+            self._worker.outlets.tell(
+                f"partition {self.number}: {said if behind else 'follows again'}"
+            )
+        self._reported = _Reported(now_s, states, behind)
+        self._worker.outlets.metrics.report(self.key, report)
+        await self._publish_health(report, changed)
+
+    async def _publish_health(
+        self, report: Mapping[str, Any], changed: Mapping[str, Mapping[str, Any]]
+    ) -> None:
+        from nats.errors import Error
+
+        with suppress(Error, OSError, TimeoutError):
+            await self._worker.buckets.health.put(self.key, json.dumps(report).encode())
+            for name, table in changed.items():
+                data = json.dumps({"robot": name, **table}).encode()
+                await self._worker.broker.client.publish(f"{names.HEALTH}.{name}", data)
+                if self._worker.outlets.retain is not None:
+                    self._worker.outlets.retain(f"fleet/health/{name}", data)
+
+
+def _short(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error)[:LONGEST_REASON]}"
+
+
+LONGEST_REASON = 200
+"""Longest text of an error that is told [characters]."""
+TOKENS = 9
+"""Parts of the reply address of a delivered message, where it names no domain."""
