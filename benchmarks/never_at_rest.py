@@ -2,6 +2,7 @@
 
     python benchmarks/never_at_rest.py [--robot armpi_fpv ur5e so101 panda] [--motion blended ...]
         [--rate 10] [--calibration generic] [--healthy 20] [--faulty 3] [--clock 0.0] [--folder]
+        [--watch 120]
     python benchmarks/never_at_rest.py --logs FOLDER [--share 0.85] [--calibration armpi_fpv]
 
 Five motions, ten seconds each: point to point without a stop, sinusoids, splines as of a leader
@@ -62,7 +63,7 @@ def blended(
 ) -> tuple[FloatArray, FloatArray]:
     """Return ramps from target to target, each beginning where the last one ends."""
     low, high = _range(robot)
-    ends = np.r_[0.0, np.cumsum(rng.uniform(0.9, 1.6, 12))]
+    ends = np.r_[0.0, np.cumsum(rng.uniform(0.9, 1.6, round(1.2 * time[-1])))]
     targets = rng.uniform(low, high, (len(ends), len(low)))
     return np.stack([np.interp(time, ends, one) for one in targets.T], axis=-1), ends
 
@@ -84,7 +85,7 @@ def splines(
 ) -> tuple[FloatArray, FloatArray]:
     """Return smooth curves through irregular points, as a person guides a leader arm."""
     low, high = _range(robot)
-    at = np.r_[0.0, np.cumsum(rng.uniform(0.5, 1.8, 24))]
+    at = np.r_[0.0, np.cumsum(rng.uniform(0.5, 1.8, round(2.4 * time[-1])))]
     found = CubicSpline(at, rng.uniform(low, high, (len(at), len(low))))(time)
     return np.clip(found, low, high), np.zeros(0)
 
@@ -94,7 +95,7 @@ def set_points(
 ) -> tuple[FloatArray, FloatArray]:
     """Return minimum-jerk strokes streamed as set points, as servoj does, none at rest."""
     low, high = _range(robot)
-    at = np.r_[0.0, np.cumsum(rng.uniform(1.0, 2.0, 14))]
+    at = np.r_[0.0, np.cumsum(rng.uniform(1.0, 2.0, round(1.4 * time[-1])))]
     targets = rng.uniform(low, high, (len(at), len(low)))
     place = np.clip(np.searchsorted(at, time, side="right") - 1, 0, len(at) - 2)
     share = ((time - at[place]) / np.diff(at)[place])[:, None]
@@ -107,9 +108,10 @@ def pick_and_place(
 ) -> tuple[FloatArray, FloatArray]:
     """Return a cycle of four poses with rounded corners, again and again."""
     low, high = _range(robot)
-    poses = rng.uniform(low, high, (4, len(low)))
-    at = np.cumsum(np.r_[0.0, np.tile(rng.uniform(0.7, 1.2, 4), 5)])
-    raw = np.stack([np.interp(time, at, np.tile(one, 6)[: len(at)]) for one in poses.T], axis=-1)
+    poses, cycles = rng.uniform(low, high, (4, len(low))), round(0.5 * time[-1])
+    at = np.cumsum(np.r_[0.0, np.tile(rng.uniform(0.7, 1.2, 4), cycles)])
+    told = [np.tile(one, cycles + 1)[: len(at)] for one in poses.T]
+    raw = np.stack([np.interp(time, at, one) for one in told], axis=-1)
     width = round(0.2 / STEP_S)
     padded = np.pad(raw, ((width, width), (0, 0)), mode="edge")
     kernel = np.ones(2 * width + 1) / (2 * width + 1)
@@ -164,21 +166,27 @@ class Arm:
 
 
 def simulated(
-    robot: Robot, motion: Path, case: Case, rate: float, late: float, arm: Arm | None = None
+    robot: Robot,
+    motion: Path,
+    case: Case,
+    rate: float,
+    late: float,
+    arm: Arm | None = None,
+    duration_s: float = DURATION_S,
 ) -> RunTable:
     """Return one run of an arm; None: of one of its own."""
     rng = np.random.default_rng([case.seed, len(robot.motors)])
-    time = as_floats(STEP_S * np.arange(round(DURATION_S / STEP_S) + 1))
+    time = as_floats(STEP_S * np.arange(round(duration_s / STEP_S) + 1))
     (command, strokes), motors = motion(robot, time, rng), len(robot.motors)
     usual, arm = generic_imperfections(robot), arm or Arm.drawn(robot, rng)
     settling = arm.settling
-    knots = np.arange(0.0, DURATION_S + 2.0 * WANDER_S, WANDER_S)
+    knots = np.arange(0.0, duration_s + 2.0 * WANDER_S, WANDER_S)
     scatter = CubicSpline(knots, rng.standard_normal((len(knots), motors)))(time)
     scatter *= np.asarray(settling.scatter)
     model = HealthyModel.of(robot, usual)
     error, onset = np.zeros((len(time), motors)), np.nan
     if case.fault == "steady_state_error":
-        onset = 0.0 if len(strokes) else rng.uniform(0.2, 0.5) * DURATION_S
+        onset = 0.0 if len(strokes) else rng.uniform(0.2, 0.5) * duration_s
         error[:, case.motor] = _errors(time, strokes, onset, rng) * model.least_visible[case.motor]
     speed = np.gradient(command, STEP_S, axis=0)
     friction = np.asarray(settling.friction) * _direction(speed)
@@ -187,7 +195,7 @@ def simulated(
     wanted = first_order_lag(wanted.T, wanted[0], STEP_S, arm.lag_s).T
     held = np.zeros((1, len(time), motors), dtype=bool)
     if case.fault == "stuck":
-        onset = rng.uniform(0.0, 0.7 * DURATION_S)
+        onset = rng.uniform(0.0, 0.7 * duration_s)
         held[0, time >= onset, case.motor] = True
     drive = Drive(wanted[None], held, compliance=arm.compliance[None])
     position = ServoEngine(robot).angles(drive, time)[0]
@@ -271,6 +279,41 @@ def of_logs(folder: str, share: float | None, calibration: str) -> None:
     print(f"{calibration}: {line(found, clock.process_time() - began)}")
 
 
+EVERY = 5
+"""Steps of a run from one sample of a stream to the next."""
+
+
+def watched(robot: Robot, run: RunTable) -> tuple[str, float, str]:
+    """Watch a run as a stream; return its truth, seconds to the first alarm since, and its cause.
+
+    Before the onset, or of a healthy robot: seconds since the beginning. No alarm: infinite.
+    """
+    watch, data = ft.monitor(robot, "generic"), run.to_dataset().isel(run=0)
+    truth, onset = str(data["fault"].values), float(data["onset"].values)
+    points, time = data["measured"].values, data["time"].values
+    for k in range(len(time)):
+        read = np.isfinite(points[k]).all()
+        if k % EVERY and not read:
+            continue
+        alarm = watch.update(time[k], data["command"].values[k], points[k] if read else None).alarm
+        if alarm.state == "alarm":
+            begin = 0.0 if np.isnan(onset) or time[k] < onset else onset
+            return truth if begin else "healthy", time[k] - begin, alarm.cause
+    return truth, np.inf, ""
+
+
+def watch_line(found: list[tuple[str, float, str]], duration_s: float) -> str:
+    """Return what was found of some streams."""
+    false = sum(truth == "healthy" and seconds < np.inf for truth, seconds, _ in found)
+    parts = [f"{false} false alarms in {len(found)} streams of {duration_s:g} s"]
+    for mode in ("stuck", "steady_state_error"):
+        some = [(seconds, cause == truth) for truth, seconds, cause in found if mode in truth]
+        right = [seconds for seconds, named in some if named and seconds < np.inf]
+        middle = np.median(right) if right else np.nan
+        parts.append(f"{mode}: {len(right)} of {len(some)} named, after {middle:.1f} s (median)")
+    return ", ".join(parts)
+
+
 def line(found: list[Diagnosis], seconds: float) -> str:
     """Return what was found of some runs."""
     healthy = [d for d in found if d.truth == "healthy"]
@@ -296,6 +339,7 @@ def main() -> None:
     parser.add_argument("--faulty", type=int, default=3)
     parser.add_argument("--clock", type=float, default=0.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--watch", type=float, help="length of streams that are watched [s]")
     parser.add_argument("--folder", action="store_true", help="one robot, judged together")
     parser.add_argument("--logs")
     parser.add_argument("--share", type=float)
@@ -309,6 +353,12 @@ def main() -> None:
             some = list(cases(robot, given.healthy, given.faulty, given.seed))
             arm = Arm.drawn(robot, np.random.default_rng(given.seed)) if given.folder else None
             sensed = given.rate, given.clock, arm
+            if given.watch:
+                told = (*sensed, given.watch)
+                streams = (simulated(robot, MOTIONS[motion], c, *told) for c in some)
+                seen = [watched(robot, stream) for stream in streams]
+                print(f"{name} {motion}: {watch_line(seen, given.watch)}", flush=True)
+                continue
             tables = [simulated(robot, MOTIONS[motion], c, *sensed) for c in some]
             runs = concatenate([table.to_dataset() for table in tables])
             began = clock.process_time()

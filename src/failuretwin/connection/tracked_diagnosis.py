@@ -233,6 +233,19 @@ def _row(
     }
 
 
+def followed_evidence(seen: Evidence, life: LifeFilter) -> SettledEvidence:
+    """Return settled positions, and moments on the way of runs that hardly rest.
+
+    A life learns from the first such run how far its tool trails the commands.
+    """
+    if not hardly_rest(seen.sound, life.model).any():
+        return seen.sound.settled
+    lag_s = life.lag_s
+    if lag_s is None:
+        lag_s = life.see_moving(likeliest_lag(seen.sound, life.model))
+    return on_the_way(seen.sound, life.model, lag_s)
+
+
 @dataclass(frozen=True)
 class _Seen:
     """Some runs, ready to be judged.
@@ -251,16 +264,9 @@ class _Seen:
 
     @classmethod
     def of(cls, runs: RunSet, diagnoser: BayesDiagnoser, life: LifeFilter) -> _Seen:
-        """Return what runs say; a life learns that it has runs that hardly rest."""
+        """Return what runs say."""
         seen = Evidence(runs, life.model.settings)
-        evidence = seen.sound.settled
-        if hardly_rest(seen.sound, life.model).any():
-            lag_s = life.lag_s
-            if lag_s is None:
-                lag_s = likeliest_lag(seen.sound, life.model)
-                life.see_moving(lag_s)
-            evidence = on_the_way(seen.sound, life.model, lag_s)
-        return cls(runs, diagnoser, seen, evidence)
+        return cls(runs, diagnoser, seen, followed_evidence(seen, life))
 
     @property
     def names(self) -> list[str]:

@@ -22,6 +22,7 @@ from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.decision.streaming.learning import LifeLearner, LifeMemory
 from failuretwin.decision.streaming.set_up_watch import PROOF, SetUpWatch
 from failuretwin.decision.streaming.trouble import DEAD, rests_throughout
+from failuretwin.decision.streaming.way_watch import WayWatch
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
@@ -113,6 +114,7 @@ class FaultMonitor(RobotStream):
         self._movements = 0
         self._explained: dict[int, float] = {}
         self._set_up = SetUpWatch(diagnoser)
+        self._way = WayWatch(diagnoser, self._mixture.filters[0]) if learns else None
         self._arrived = np.full((0, len(known.scatter)), np.nan)
         self._rests, self._misfit = False, 0.0
         if len(self._models) == 1 and self._learner is not None and self._learner.movements:
@@ -171,12 +173,16 @@ class FaultMonitor(RobotStream):
         return self._set_up.against(alarm) or odd or self._unheard(alarm.cause)
 
     def _watch(self, time: float, reference: FloatArray | None, point: FloatArray | None) -> None:
-        """Look at the set-up, and count as noise what the sensor was found to round off."""
+        """Look at the set-up, count as noise what is rounded off, and judge what never rests."""
         self._set_up.see(time, reference, point)
         found = self._set_up.rounding
         if self._fleet.rounding is None and found is not None:
             self._fleet.count_as_noise(found)
             self._models = [rounded(model, found, None) for model in self._models]
+        hours = 0.0 if self._way is None else self._way.see(time, reference, point)
+        if self._way is not None and hours > 0.0:
+            self._rule.see(self._fleet.time, self._way.posterior, hours)
+            self._diagnosis = self._way.diagnosis
 
     def _unheard(self, cause: str) -> str:
         """Return that commands do not reach the motor that a fault is blamed on; else nothing."""
@@ -193,6 +199,9 @@ class FaultMonitor(RobotStream):
     def _judge(self) -> None:
         """Renew what is believed by what the last movements say."""
         seen, told = self._fleet.seen(0), None
+        on_way = self._way is not None and self._way.diagnosis is not None
+        if seen is not None and on_way and not seen[0].usable.any():
+            return  # no movement was seen at rest
         if seen is not None:
             likelihood, position = seen
             posterior, before = self._followed(likelihood, position), position.movements

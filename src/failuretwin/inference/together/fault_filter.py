@@ -201,7 +201,7 @@ class FaultFilter:
             movement: Which of them.
         """
         hours = seen.hours[:, movement, None]
-        came = 1.0 - np.exp(-hours * self._rate)  # (robot, hypothesis)
+        came = 1.0 - np.exp(-hours * self.rate_per_h)  # (robot, hypothesis)
         mended = 1.0 - np.exp(-hours[:, 0] * self.rates.repairs_per_1000_h / 1000.0)
         broken = belief.held.sum(axis=1) + belief.off.sum(axis=1)
         healthy = belief.healthy * (1.0 - came.sum(axis=1)) + mended * broken
@@ -252,7 +252,7 @@ class FaultFilter:
     @property
     def faults_per_h(self) -> float:
         """Faults of the whole robot in an hour."""
-        return float(self._rate.sum())
+        return float(self.rate_per_h.sum())
 
     def _of(self, signature: Signature) -> list[Fault]:
         """Return the faults of one signature."""
@@ -260,8 +260,8 @@ class FaultFilter:
         return [fault for fault in faults if MODES[fault.mode].signature is signature]
 
     @cached_property
-    def _rate(self) -> FloatArray:
-        """Rate of each hypothesis, (hypothesis,) [1/h]: a motor's, shared by the odds of modes."""
+    def rate_per_h(self) -> FloatArray:
+        """Rate of each fault, (hypothesis,) [1/h]: a motor's, shared by the odds of modes."""
         learned = [self.priors.factor_of(h) for h in self.hypotheses]
         return self.rates.faults_per_1000_h / 1000.0 * shares_of_motors(self.hypotheses) * learned
 

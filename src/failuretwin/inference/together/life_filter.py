@@ -179,13 +179,12 @@ class LifeFilter:
         self.window = self._without_oldest(window)
         return found.weighing.posterior()
 
-    def see_moving(self, lag_s: float) -> None:
+    def see_moving(self, lag_s: float) -> float:
         """Let runs that hardly rest be followed too: lags are in doubt from now on.
 
         Args:
-            lag_s: How far the tool trails its commands in them [s].
+            lag_s: How far the tool trails its commands in them [s]; returned.
         """
-        assert self.lag_s is None, "runs that hardly rest are followed already"
         before, seen = len(self.unit), None if self.window is None else self.window.given.evidence
         self.lag_s = lag_s
         believed = robot_components(self.model, self.layout, AS_TOLD)
@@ -201,6 +200,7 @@ class LifeFilter:
             window.here[:before] = self.window.here
             window.maximise()
             self.window = window
+        return lag_s
 
     @property
     def layout(self) -> Layout:

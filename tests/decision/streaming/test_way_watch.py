@@ -1,0 +1,55 @@
+"""An arm that never rests, watched: a window of its life after the other."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from failuretwin.core.hypothesis import CLEAR, RAISED
+from failuretwin.decision.streaming.monitor import monitor
+from failuretwin.digital_model.robot import load_robot
+from failuretwin.digital_model.twin import DigitalTwin
+
+ROBOT = load_robot("armpi_fpv")
+STEP_S, LAG_S, NOISE_M = 0.05, 0.1, 5e-4
+
+
+def stream(seconds, seed, stuck_s=np.inf, motor=1):
+    """Yield time, command and reading of a smooth motion; a motor may stop."""
+    rng = np.random.default_rng(seed)
+    knots = np.arange(-1.0, seconds + 2.0, 0.9)
+    told = CubicSpline(knots, rng.uniform(-0.7, 0.7, (len(knots), 4)))
+    twin, held = DigitalTwin(ROBOT), None
+    for k in range(round(seconds / STEP_S)):
+        time = k * STEP_S
+        command, seen = told(time), told(time - LAG_S)
+        if time >= stuck_s:
+            held = seen[motor] if held is None else held
+            seen[motor] = held
+        point = twin.path(seen) + rng.normal(scale=NOISE_M, size=3) if k % 2 == 0 else None
+        yield time, command, point
+
+
+def watch(samples):
+    """Return the watch after all samples, and the time at which its alarm was raised."""
+    found, raised = monitor("armpi_fpv", "generic"), None
+    for sample in samples:
+        answer = found.update(*sample)
+        if raised is None and answer.alarm.state == RAISED:
+            raised = sample[0]
+    return answer, raised
+
+
+def test_a_healthy_arm_raises_no_alarm():
+    answer, _ = watch(stream(45.0, 3))
+    assert answer.alarm.state == CLEAR
+    assert answer.diagnosis.posterior["healthy"] > 0.99
+    assert "readings on the way" in answer.diagnosis.method
+
+
+@pytest.mark.parametrize("motor", [0, 2])
+def test_a_motor_that_stops_is_named_within_three_windows(motor):
+    answer, raised = watch(stream(45.0, 4 + motor, stuck_s=20.0, motor=motor))
+    assert 20.0 < raised < 38.5
+    assert answer.alarm.cause == f"motor_{motor + 1}:stuck"
+    assert answer.diagnosis.diagnosis == f"motor_{motor + 1}:stuck"
+    assert answer.diagnosis.onset_s == pytest.approx(20.0, abs=6.5)  # a window
