@@ -239,7 +239,7 @@ def _sensed(
     late: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    at = np.arange(0.0, DURATION_S, 1.0 / rate)
+    at = np.arange(0.0, time[-1], 1.0 / rate)
     seen = np.stack([np.interp(at - late, time, one) for one in position.T], axis=-1)
     if robot.profile.sensor_pose == "log":
         units = robot.servo_units

@@ -159,7 +159,7 @@ def test_what_else_it_may_be_is_told():
 
 @pytest.mark.parametrize(
     ("nats", "told_so"),
-    [((0.1, 0.2, 6.0), True), ((0.1, 3.0, 3.0), False), ((0.1, 6.0, 0.1), False)],
+    [((0.1, 0.2, 6.0), True), ((0.1, 3.0, 6.0), False), ((0.1, 6.0, 0.1), False)],
 )
 def test_a_stop_that_the_last_movement_alone_shows_may_be_a_lost_command(nats, told_so):
     evidence = tuple(MovementEvidence(m + 1, shown) for m, shown in enumerate(nats))

@@ -144,8 +144,8 @@ def _shows_last(diagnosis: Diagnosis, best: Hypothesis) -> bool:
     """Return whether only the last movement says that a motor is stuck."""
     if [fault.mode for fault in best.faults] != [STUCK] or not rests_on_one_movement(diagnosis):
         return False
-    most = max(diagnosis.evidence, key=lambda movement: movement.nats)
-    return len(diagnosis.evidence) > 1 and most is diagnosis.evidence[-1]
+    *before, last = (movement.nats for movement in diagnosis.evidence)
+    return bool(before) and max(before) < TELLING_NATS < last
 
 
 _TOLD_UNITS = {
