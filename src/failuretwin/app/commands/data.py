@@ -12,7 +12,12 @@ import click
 
 import failuretwin as ft
 from failuretwin.app.commands import options as opt
-from failuretwin.app.commands.store import StoreOptions, recorded_option, store_options
+from failuretwin.app.commands.store import (
+    StoreOptions,
+    recorded_option,
+    store_option,
+    store_options,
+)
 from failuretwin.app.terminal import progress_bar, show, tell
 from failuretwin.core.errors import InputError, counted
 
@@ -62,7 +67,22 @@ def import_(
 
 
 @click.command()
-@opt.file_option("--out", "FILE", "Run set to write (.nc or .zarr).", required=True)
+@opt.file_option("--out", "FILE", "Run set to write (.nc or .zarr).")
+@click.option(
+    "--fleet",
+    "robots",
+    type=click.IntRange(1, 1_000_000),
+    metavar="N",
+    help="With --years and --store: simulate the lives of so many robots into the store, a check "
+    "run a week, with wear, repairs, payloads, temperature and shifts.",
+)
+@click.option(
+    "--years",
+    type=click.FloatRange(0.1, 100.0),
+    metavar="Y",
+    help="With --fleet: length of the lives, up to today.",
+)
+@store_option
 @opt.count_option("--runs-per-class", 400, "Runs of each hypothesis; the paper has 400.", least=1)
 @opt.hypotheses_option(
     "Hypotheses to simulate, such as healthy,motor_2:stuck. Default: the paper's nine classes."
@@ -91,7 +111,10 @@ def import_(
 @opt.plugin_option
 @opt.calibrated_robot_options("none")
 def simulate(
-    out: Path,
+    out: Path | None,
+    robots: int | None,
+    years: float | None,
+    store: str | None,
     runs_per_class: int,
     hypotheses: str | None,
     engine: str,
@@ -110,6 +133,11 @@ def simulate(
     from failuretwin.data_knowledge.store import check_destination
     from failuretwin.failure_behavior.registry import MODES, load_modes
 
+    if robots is not None or years is not None:
+        _simulate_fleet(robots, years, store, force, robot)
+        return
+    if out is None:
+        raise InputError("nothing says where to write. Give --out FILE, or --fleet N --years Y.")
     check_destination(out)
     known = robot.known
     names = known.robot.motor_names
@@ -129,6 +157,34 @@ def simulate(
     with progress_bar("simulating", plan.size) as advance:
         produce(plan, out, workforce, advance, tell=lambda text: tell(text, err=True))
     tell(f"{counted(plan.size, 'run')} written to {out}")
+
+
+LIVES = ("out", "runs_per_class", "hypotheses", "engine", "sensors", "faults")
+"""Options of `simulate` that lives do not have."""
+
+
+def _simulate_fleet(
+    robots: int | None,
+    years: float | None,
+    store: str | None,
+    force: opt.WorkforceOptions,
+    robot: opt.RobotOptions,
+) -> None:
+    from failuretwin.app.simulated_years import Years, last_midnight, write_years
+
+    opt.refuse_unused("lives of robots go into the store", *LIVES)
+    if robots is None or years is None or store is None:
+        raise InputError("lives need --fleet N, --years Y and --store URL. Give all three.")
+    own = ft.load_calibration(None, robot.robot) if _is_none(robot.calibration) else robot.known
+    plan = Years(own, years, last_midnight(), robot.seed)
+    with progress_bar("simulating lives", robots) as advance:
+        done = write_years(ft.open_store(store), plan, robots, force.workforce, advance)
+    tell(f"written to {store}: {done}")
+
+
+def _is_none(calibration: Path | None) -> bool:
+    """Return whether nobody has named a calibration: ideal robots would not wear."""
+    return calibration is not None and str(calibration) == "none"
 
 
 # `failuretwin robot`: bring a robot of your own, from its URDF.
