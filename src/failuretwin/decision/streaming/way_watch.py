@@ -31,6 +31,11 @@ from failuretwin.inference.together.fault_filter import MOST_NATS, S_PER_H, Faul
 
 WINDOW_S = 6.0
 """Length of a window [s]: some moments on the way."""
+PAUSE_S = 0.5
+"""Time without a new command from which an arm may come to rest [s]: such windows are left to what
+sees rests."""
+STILL_RAD = 1e-5
+"""Change of a command that is none [rad]."""
 FEWEST = 6
 """Readings of a window that is judged, at least."""
 FINEST_S = 0.01
@@ -84,7 +89,7 @@ class WayWatch:
 
     def _judge(self, some: Sequence[Sample], hours: float) -> bool:
         """Judge a window; return whether its tool never rests."""
-        runs = _as_run(some, self._diagnoser)
+        runs = None if _longest_pause(some) > PAUSE_S else _as_run(some, self._diagnoser)
         if runs is None:
             return False
         life, seen = self._life, Evidence(runs.to_dataset(), self._life.model.settings)
@@ -108,6 +113,13 @@ class WayWatch:
         after[self._healthy] = healthy * (1.0 - came.sum()) + mended * (1.0 - healthy)
         after = after * np.exp(says)
         self.posterior = after / after.sum()
+
+
+def _longest_pause(some: Sequence[Sample]) -> float:
+    """Return the longest time within samples in which no motor is told anything new [s]."""
+    time, told = np.array([at for at, _, _ in some]), np.stack([one for _, one, _ in some])
+    news = np.abs(np.diff(told, axis=0)).max(axis=1) > STILL_RAD
+    return float(np.diff(np.r_[time[0], time[1:][news], time[-1]]).max())
 
 
 def _as_run(some: Sequence[Sample], diagnoser: BayesDiagnoser) -> RunTable | None:
