@@ -25,7 +25,8 @@ import numpy as np
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
-from failuretwin.data_knowledge.records.history import CONFIRMED, WRONG, FaultEpisode
+from failuretwin.data_knowledge.records.episodes import CONFIRMED
+from failuretwin.data_knowledge.records.history import WRONG, FaultEpisode
 from failuretwin.data_knowledge.records.log_files import LogFile
 from failuretwin.data_knowledge.records.store import Store
 from failuretwin.data_knowledge.workers import Workforce
