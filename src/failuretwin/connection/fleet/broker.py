@@ -44,8 +44,6 @@ LEASES, WORKERS, SNAPSHOTS, HEALTH_BUCKET, PROFILES = (
 """Buckets: who holds a partition, who works, the last snapshots, health by partition, profiles."""
 STATES = "fleet_states"
 """Object store of the snapshots themselves."""
-LEASE_S = 6.0
-"""Time without renewal after which a partition is free [s]."""
 LARGEST_STREAM = 2 * 1024**3
 """Room for events that no snapshot covers [bytes]."""
 ALARMS_KEPT_S = 90 * 86_400.0

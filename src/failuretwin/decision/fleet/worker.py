@@ -1,9 +1,10 @@
 """A worker: holds partitions by leases, filters their robots, and keeps snapshots of them.
 
 Whoever holds the lease of a partition goes on from its last snapshot and replays what came after
-it. Its alarms are the same again, and the server stores each once. A lease that is not renewed
-ends by the clock of the server, so clocks of workers do not matter. A worker that was paused finds
-its lease gone when it goes on; what it still says is known already.
+it. Its alarms are the same again, and the server stores each once. A lease that has not been
+renewed while somebody looked at it several times is free: whoever replaces that very revision of
+it has it. So no clock matters. A worker that was paused finds that its lease is another's when it
+goes on; what it still says is known already.
 
 Section: docs/fleet.md#workers
 """
@@ -36,7 +37,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 RENEW_S = 1.5
-"""Time between two looks at the leases [s]; a quarter of `LEASE_S`."""
+"""Time between two looks at the leases [s]; own ones are renewed then."""
+UNCHANGED, FORGOTTEN = 4, 40
+"""Looks in a row at which a lease or a worker has not changed, from which it is dead, and from
+which the name of a worker is deleted."""
 CYCLE_S = 0.5
 """Least time between two fetches [s], so that many robots are judged together."""
 FETCH, FETCH_S = 4000, 1.0
@@ -50,6 +54,8 @@ BEHIND_S = 10.0
 STALE = "stale"
 
 
+ANSWER_S = 5.0
+"""Longest wait for the entries of a bucket [s]."""
 ABANDON_S = 5.0
 """Longest wait for work that is abandoned [s]."""
 
@@ -105,8 +111,8 @@ class Buckets:
     async def of(cls, broker: Broker) -> Buckets:
         """Return the buckets of a server, made where they are missing."""
         return cls(
-            await broker.bucket(names.LEASES, ttl=names.LEASE_S),
-            await broker.bucket(names.WORKERS, ttl=names.LEASE_S),
+            await broker.bucket(names.LEASES),
+            await broker.bucket(names.WORKERS),
             await broker.bucket(names.SNAPSHOTS),
             await broker.bucket(names.HEALTH_BUCKET),
             await broker.bucket(names.PROFILES),
@@ -131,6 +137,7 @@ class Worker:
         self.outlets = outlets
         self.buckets: Buckets
         self._held: dict[int, _Holder] = {}
+        self._leases, self._workers = _Watched(), _Watched()
         self._computer = ThreadPoolExecutor(1, "filter")
         self._trouble = ""
 
@@ -171,24 +178,25 @@ class Worker:
     async def _renew(self) -> None:
         from nats.js.errors import KeyWrongLastSequenceError
 
-        own = self.settings.name.encode()
         for holder in list(self._held.values()):
             try:
-                number = await self.buckets.leases.update(holder.key, own, last=holder.lease)
-                holder.lease, holder.renewed_s = number, time.monotonic()
+                holder.lease = await self.buckets.leases.update(
+                    holder.key, self.settings.name.encode(), last=holder.lease
+                )
             except KeyWrongLastSequenceError:
                 await self._drop(holder, "another worker has it")
-            except Exception:
-                if time.monotonic() - holder.renewed_s > names.LEASE_S:
-                    await self._drop(holder, "its lease could not be renewed")
-                raise
+                continue
             if holder.task.done():
                 await self._drop(holder, "its work failed")
 
     async def _balance(self) -> None:
         table = {"partitions": sorted(self._held), "at": time.time()}
         await self.buckets.workers.put(self.settings.name, json.dumps(table).encode())
-        alive = len(await _keys(self.buckets.workers))
+        await self._workers.look(self.buckets.workers)
+        await self._leases.look(self.buckets.leases)
+        for name in self._workers.unchanged(FORGOTTEN):
+            await self.buckets.workers.delete(name)
+        alive = len(self._workers.revisions) - len(self._workers.unchanged(UNCHANGED))
         due = math.ceil(self.settings.partitions / max(alive, 1))
         self.outlets.metrics.workers.set(alive)
         if len(self._held) > due:
@@ -197,17 +205,22 @@ class Worker:
             await self._take(due - len(self._held))
 
     async def _take(self, most: int) -> None:
-        """Take partitions that nobody holds."""
+        """Take partitions that nobody holds, or whose holders have died."""
         from nats.js.errors import KeyWrongLastSequenceError
 
-        taken = await _keys(self.buckets.leases)
-        free = [k for k in range(self.settings.partitions) if f"p{k}" not in taken]
-        for number in free[:most]:
+        known, dead = self._leases.revisions, self._leases.unchanged(UNCHANGED)
+        keys = {f"p{number}": number for number in range(self.settings.partitions)}
+        free = [key for key in keys if key not in known or key in dead]
+        own, leases = self.settings.name.encode(), self.buckets.leases
+        for key in free[:most]:
             try:
-                lease = await self.buckets.leases.create(f"p{number}", self.settings.name.encode())
+                if key in known:
+                    lease = await leases.update(key, own, last=known[key])
+                else:
+                    lease = await leases.create(key, own)
             except KeyWrongLastSequenceError:  # somebody was faster
                 continue
-            self._held[number] = _Holder(self, number, lease)
+            self._held[keys[key]] = _Holder(self, keys[key], lease)
             self.outlets.metrics.partitions.set(len(self._held))
 
     async def _release(self, holder: _Holder) -> None:
@@ -227,13 +240,40 @@ class Worker:
             self.outlets.tell(f"partition {holder.number} is given up: {why}")
 
 
-async def _keys(bucket: KeyValue) -> set[str]:
-    from nats.js.errors import NoKeysError
+class _Watched:
+    """The entries of a bucket as they were seen, look by look.
 
+    Attributes:
+        revisions: Newest revision of each key.
+    """
+
+    def __init__(self) -> None:
+        self.revisions: dict[str, int] = {}
+        self._looks: dict[str, int] = {}
+
+    async def look(self, bucket: KeyValue) -> None:
+        """Look at all entries."""
+        found = {key: entry.revision or 0 for key, entry in (await _entries(bucket)).items()}
+        self._looks = {
+            key: self._looks[key] + 1 if self.revisions.get(key) == revision else 0
+            for key, revision in found.items()
+        }
+        self.revisions = found
+
+    def unchanged(self, looks: int) -> set[str]:
+        """Return the keys that have not changed for some looks."""
+        return {key for key, count in self._looks.items() if count >= looks}
+
+
+async def _entries(bucket: KeyValue) -> dict[str, KeyValue.Entry]:
+    """Return all entries of a bucket by key."""
+    watcher, found = await bucket.watchall(ignore_deletes=True), dict[str, Any]()
     try:
-        return set(await bucket.keys())
-    except NoKeysError:
-        return set()
+        while (entry := await watcher.updates(timeout=ANSWER_S)) is not None:
+            found[entry.key] = entry
+    finally:
+        await watcher.stop()
+    return found
 
 
 @dataclass
@@ -250,7 +290,6 @@ class _Holder:
 
     def __init__(self, worker: Worker, number: int, lease: int) -> None:
         self.number, self.key, self.lease = number, f"p{number}", lease
-        self.renewed_s = time.monotonic()
         self._worker = worker
         self._subject = f"{names.BY_PARTITION}.{number}.>"
         self._stop = asyncio.Event()
@@ -332,8 +371,7 @@ class _Holder:
     async def _announced(self) -> dict[str, ProfileMessage]:
         """Return the profiles that are known of all robots."""
         found = {}
-        for name in await _keys(self._worker.buckets.profiles):
-            entry = await self._worker.buckets.profiles.get(name)
+        for name, entry in (await _entries(self._worker.buckets.profiles)).items():
             with suppress(InputError):
                 found[name] = parse_profile(entry.value or b"")
         return found
@@ -448,7 +486,7 @@ class _Holder:
         """Return the result of work with the server, tried until it answers.
 
         Raises:
-            LeaseLostError: If the lease has ended meanwhile.
+            LeaseLostError: If the work is to end meanwhile.
         """
         from nats.errors import Error
 
@@ -456,7 +494,7 @@ class _Holder:
             try:
                 return await work(*values)
             except (Error, OSError, TimeoutError):
-                if time.monotonic() - self.renewed_s > 2.0 * names.LEASE_S:
+                if self._stop.is_set():
                     raise LeaseLostError(f"partition {self.number}") from None
                 await asyncio.sleep(0.5)
 
