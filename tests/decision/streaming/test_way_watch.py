@@ -13,8 +13,8 @@ ROBOT = load_robot("armpi_fpv")
 STEP_S, LAG_S, NOISE_M = 0.05, 0.1, 5e-4
 
 
-def stream(seconds, seed, stuck_s=np.inf, motor=1):
-    """Yield time, command and reading of a smooth motion; a motor may stop."""
+def stream(seconds, seed, stuck_s=np.inf, motor=1, off_s=np.inf, off_rad=0.1):
+    """Yield time, command and reading of a smooth motion; a motor may stop or go off."""
     rng = np.random.default_rng(seed)
     knots = np.arange(-1.0, seconds + 2.0, 0.9)
     told = CubicSpline(knots, rng.uniform(-0.7, 0.7, (len(knots), 4)))
@@ -22,6 +22,7 @@ def stream(seconds, seed, stuck_s=np.inf, motor=1):
     for k in range(round(seconds / STEP_S)):
         time = k * STEP_S
         command, seen = told(time), told(time - LAG_S)
+        seen[motor] += off_rad * (time >= off_s)
         if time >= stuck_s:
             held = seen[motor] if held is None else held
             seen[motor] = held
@@ -53,3 +54,17 @@ def test_a_motor_that_stops_is_named_within_three_windows(motor):
     assert answer.alarm.cause == f"motor_{motor + 1}:stuck"
     assert answer.diagnosis.diagnosis == f"motor_{motor + 1}:stuck"
     assert answer.diagnosis.onset_s == pytest.approx(20.0, abs=6.5)  # a window
+
+
+def test_an_error_that_comes_is_named():
+    answer, raised = watch(stream(60.0, 7, off_s=26.0))
+    assert 26.0 < raised < 50.5
+    assert answer.diagnosis.diagnosis == "motor_2:steady_state_error"
+    assert answer.diagnosis.magnitude == pytest.approx(0.1, abs=0.04)
+
+
+def test_an_error_from_the_beginning_may_be_the_log():
+    """A zero that is off looks like it: no motor is blamed."""
+    answer, raised = watch(stream(40.0, 7, off_s=0.0, off_rad=0.15))
+    assert raised is None
+    assert answer.alarm.state == CLEAR

@@ -167,7 +167,9 @@ class FaultMonitor(RobotStream):
         """
         if self._rests:
             return DEAD.fatal
-        alarm = self._rule.alarm
+        alarm, way = self._rule.alarm, self._way
+        if way is not None and way.fits and self._diagnosis is way.diagnosis:
+            return self._unheard(alarm.cause)
         young = self._set_up.movements <= PROOF and alarm.state == CLEAR
         odd = BEGINS_ODDLY if young and self._misfit > FITS else ""
         return self._set_up.against(alarm) or odd or self._unheard(alarm.cause)

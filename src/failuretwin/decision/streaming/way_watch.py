@@ -36,6 +36,8 @@ PAUSE_S = 0.5
 sees rests."""
 STILL_RAD = 1e-5
 """Change of a command that is none [rad]."""
+FITTING = 3
+"""Windows that a healthy robot explains best from which the log fits the profile."""
 FEWEST = 6
 """Readings of a window that is judged, at least."""
 FINEST_S = 0.01
@@ -51,6 +53,7 @@ class WayWatch:
     Attributes:
         posterior: Probability of each hypothesis, (hypothesis,).
         diagnosis: By the last window without a rest; None before it.
+        fitting: Windows so far that a healthy robot explains best.
     """
 
     def __init__(self, diagnoser: BayesDiagnoser, own: FaultFilter) -> None:
@@ -66,6 +69,12 @@ class WayWatch:
         self._healthy = [h.is_healthy for h in diagnoser.hypothesis_set].index(True)
         self.posterior = np.eye(len(diagnoser.hypothesis_set))[self._healthy]
         self.diagnosis: Diagnosis | None = None
+        self.fitting = 0
+
+    @property
+    def fits(self) -> bool:
+        """Whether the log has been seen to fit the profile: what comes later is a fault."""
+        return self.fitting >= FITTING
 
     def see(self, time: float, reference: FloatArray | None, point: FloatArray | None) -> float:
         """Take a sample; return the length of the window that it ends and that was judged [h].
@@ -98,6 +107,7 @@ class WayWatch:
         found = life.follow(followed_evidence(seen, life))
         says = found.log_posterior[0] - found.log_prior
         self._advance(np.clip(says - says[self._healthy], -MOST_NATS, MOST_NATS), hours)
+        self.fitting += int(found.log_posterior[0].argmax() == self._healthy)
         found = replace(found, log_posterior=log_of(self.posterior)[None])
         place = StreamPosition(some[0][0], 0, self.diagnosis)
         self.diagnosis = found.to_diagnosis(0, "stream", seen.quality[0], place=place)
