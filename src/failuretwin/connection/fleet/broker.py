@@ -208,8 +208,8 @@ async def open_broker(access: Access, name: str) -> Broker:
             name=name,
             error_cb=note,
             connect_timeout=5,
-            reconnect_time_wait=TRIES_S,
-            max_reconnect_attempts=-1,
+            reconnect_time_wait=0.2,
+            max_reconnect_attempts=1,
             allow_reconnect=False,
             **options,
         )
@@ -218,7 +218,12 @@ async def open_broker(access: Access, name: str) -> Broker:
             f"fleet server {access.shown}: {seen[-1] if seen else error}. Expected a NATS server "
             "with JetStream that lets us in; see docs/fleet.md."
         ) from error
-    client.options["allow_reconnect"] = True  # it has let us in once
+    # It has let us in once: from now on it is waited for.
+    client.options |= {
+        "allow_reconnect": True,
+        "max_reconnect_attempts": -1,
+        "reconnect_time_wait": TRIES_S,
+    }
     return Broker(client)
 
 
