@@ -107,14 +107,14 @@ class Broker:
         self.client = client
         self.stream: JetStreamContext = client.jetstream(timeout=5.0)
 
-    async def bucket(self, name: str, **settings: Any) -> KeyValue:
+    async def bucket(self, name: str) -> KeyValue:
         """Return a bucket, made if it is new."""
         from nats.js.errors import BucketNotFoundError
 
         try:
             return await self.stream.key_value(name)
         except BucketNotFoundError:
-            return await self.stream.create_key_value(bucket=name, history=1, **settings)
+            return await self.stream.create_key_value(bucket=name, history=1)
 
     async def states(self) -> ObjectStore:
         """Return the store of snapshots, made if it is new."""
