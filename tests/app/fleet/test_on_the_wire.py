@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import socket
 import subprocess
 import time
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from failuretwin.app.cli import cli
 from failuretwin.connection.fleet.broker import IN, Access, open_broker
 from failuretwin.connection.fleet.messages import (
     events_binary,
@@ -22,7 +25,7 @@ from failuretwin.connection.links.base import Reading
 from failuretwin.core.errors import InputError
 from fleet_messages import PROFILE_OF
 from fleet_servers import Mosquitto, NatsServer
-from running_fleet import ask, health, until, worker_thread
+from running_fleet import alarms, ask, health, start, until, worker_thread
 
 READING = events_json([Reading(1.0, np.array([0.1, 0.0, 0.3]))])
 
@@ -245,3 +248,33 @@ def test_tls_users_and_permissions_are_kept(guarded):
         while "own" not in robots(opened(worker, health)) and time.monotonic() < end:
             time.sleep(0.3)
         assert robots(opened(worker, health)).keys() == {"own"}
+
+
+# The command line.
+
+
+def test_a_bridge_and_the_status_on_the_command_line(server, tmp_path):
+    """Two emulated robots, one with a fault; figures; the status."""
+    with worker_thread(server.url) as (told, metrics):
+        words = ("bridge", "emulated", "--fleet", server.url, "--robots", "2", "--speed", "0")
+        log = tmp_path / "bridge.log"
+        fault = ("--fault", "motor_3:stuck@6", "--seconds", "25")
+        assert start(log, *words, *fault).wait(90) == 0, log.read_text()
+        assert "2 emulated robots to" in log.read_text()
+        until(server.url, alarms, lambda found: len(found) == 1)
+        assert any("arm_0: alarm: motor_3:stuck (episode 1)" in line for line in told)
+        assert (
+            metrics.registry.get_sample_value("failuretwin_alarms_total", {"state": "alarm"}) == 1
+        )
+        until(server.url, health, lambda found: robots(found).keys() == {"arm_0", "arm_1"})
+        done = CliRunner().invoke(cli, ["fleet", "status", "--fleet", server.url])
+    assert done.exit_code == 0, done.output
+    for words in ("2 robots, 1 alarms", "left out so far: nothing", "inside"):
+        assert words in done.output
+    assert re.search(r"arm_0 +(alarm|stale) +motor_3:stuck", done.output)
+
+
+def test_a_server_that_is_not_there_is_one_error():
+    for words in (["worker", "nats://127.0.0.1:1"], ["fleet", "status", "--fleet", "http://x"]):
+        with pytest.raises(InputError, match="fleet server"):
+            CliRunner().invoke(cli, words, catch_exceptions=False, standalone_mode=False)

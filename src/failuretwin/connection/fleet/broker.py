@@ -107,14 +107,14 @@ class Broker:
         self.client = client
         self.stream: JetStreamContext = client.jetstream(timeout=5.0)
 
-    async def bucket(self, name: str, **settings: Any) -> KeyValue:
+    async def bucket(self, name: str) -> KeyValue:
         """Return a bucket, made if it is new."""
         from nats.js.errors import BucketNotFoundError
 
         try:
             return await self.stream.key_value(name)
         except BucketNotFoundError:
-            return await self.stream.create_key_value(bucket=name, history=1, **settings)
+            return await self.stream.create_key_value(bucket=name, history=1)
 
     async def states(self) -> ObjectStore:
         """Return the store of snapshots, made if it is new."""
@@ -208,8 +208,8 @@ async def open_broker(access: Access, name: str) -> Broker:
             name=name,
             error_cb=note,
             connect_timeout=5,
-            reconnect_time_wait=TRIES_S,
-            max_reconnect_attempts=-1,
+            reconnect_time_wait=0.2,
+            max_reconnect_attempts=1,
             allow_reconnect=False,
             **options,
         )
@@ -218,7 +218,12 @@ async def open_broker(access: Access, name: str) -> Broker:
             f"fleet server {access.shown}: {seen[-1] if seen else error}. Expected a NATS server "
             "with JetStream that lets us in; see docs/fleet.md."
         ) from error
-    client.options["allow_reconnect"] = True  # it has let us in once
+    # It has let us in once: from now on it is waited for.
+    client.options |= {
+        "allow_reconnect": True,
+        "max_reconnect_attempts": -1,
+        "reconnect_time_wait": TRIES_S,
+    }
     return Broker(client)
 
 
