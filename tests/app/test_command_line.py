@@ -94,7 +94,7 @@ def test_options_take_the_names_of_the_networks_and_of_the_streams():
     assert tuple(options["watch", "--sensing"].type.choices) == STREAMED
 
 
-OWN_SHAPE = {"--fault", "--on", "--out", "--sensing"}
+OWN_SHAPE = {"--fault", "--fleet", "--on", "--out", "--sensing"}
 """Options that mean something else in each command."""
 
 

@@ -63,7 +63,7 @@ partitions_option = click.option(
 @click.command()
 @click.argument("source", metavar="SOURCE")
 @server_option
-@click.option("--name", metavar="ROBOT", help="Name of the robot. Default: that of its profile.")
+@click.option("--name", help="Name of the robot. Default: that of its profile.")
 @click.option(
     "--robots",
     type=click.IntRange(1, 100_000),
@@ -71,7 +71,7 @@ partitions_option = click.option(
     metavar="N",
     help="With `emulated`: how many; each --fault is that of one of them.",
 )
-@opt.flag_option("--json", "Send JSON instead of the compact form.")
+@opt.flag_option("--as-json", "Send JSON instead of the compact form.")
 @access_options
 @opt.live_options
 @opt.plugin_option
@@ -81,7 +81,7 @@ def bridge(
     url: str,
     name: str | None,
     robots: int,
-    json: bool,
+    as_json: bool,
     access: AccessOptions,
     live: opt.LiveOptions,
     robot: opt.RobotOptions,
@@ -96,11 +96,11 @@ def bridge(
 
     to = access.to(url)
     if source == opt.EMULATED:
-        bridge_emulated(to, name or "arm", robots, live, robot, json)
+        bridge_emulated(to, name or "arm", robots, live, robot, as_json)
         return
     if robots != 1:
         opt.refuse_unused("only emulated robots are many", "robots")
-    bridge_one(to, source, name or robot.model.name, live, robot, json)
+    bridge_one(to, source, name or robot.model.name, live, robot, as_json)
 
 
 @click.command()
