@@ -69,7 +69,9 @@ def bridge_emulated(
     run_until_stopped(main)
 
 
-def _publisher(broker: Broker, stop: asyncio.Event, robot: RobotOptions, as_json: bool) -> Publisher:
+def _publisher(
+    broker: Broker, stop: asyncio.Event, robot: RobotOptions, as_json: bool
+) -> Publisher:
     return Publisher(broker, tell, stop, None if as_json else len(robot.model.motors))
 
 
