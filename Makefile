@@ -10,6 +10,7 @@ demo: .venv/demo
 	$(BIN)/python examples/demo.py
 
 test: .venv/ready lint
+	@$(BIN)/python -c "import failuretwin as ft; ft.diagnose(ft.sample_log())"  # compiles the engine once
 	$(BIN)/pytest -m "not slow" --numprocesses 2 --dist loadfile
 
 # A server, 100 emulated robots and two workers on this computer, until Ctrl-C.
