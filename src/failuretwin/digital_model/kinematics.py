@@ -52,6 +52,23 @@ def _start(R: FloatArray, p: FloatArray) -> None:
 
 
 @compiled
+def _pass(
+    R: FloatArray,
+    p: FloatArray,
+    T: FloatArray,
+    value: float,
+    slides: bool,
+    axis: FloatArray,
+    origin: FloatArray,
+) -> None:
+    """Pass a joint behind a constant transform; write its axis and where it lies."""
+    _advance(R, p, T)
+    for i in range(3):
+        axis[i], origin[i] = R[i, 2], p[i]
+    _move(R, p, value, slides)
+
+
+@compiled
 def _write_frames(
     q: FloatArray, transforms: FloatArray, slides: BoolArray, found: FloatArray
 ) -> None:
@@ -83,10 +100,7 @@ def _write_positions(
     for n in range(len(q)):
         _start(R, p)
         for j in range(joints):
-            _advance(R, p, transforms[j])
-            for i in range(3):
-                axis[j, i], origin[j, i] = R[i, 2], p[i]
-            _move(R, p, q[n, j], slides[j])
+            _pass(R, p, transforms[j], q[n, j], slides[j], axis[j], origin[j])
         _advance(R, p, transforms[joints])
         for i in range(3):
             point[n, i] = p[i]
@@ -125,10 +139,7 @@ def _write_torques(
     for n in range(len(q)):
         _start(R, p)
         for j in range(joints):
-            _advance(R, p, transforms[j])
-            for i in range(3):
-                axis[j, i], origin[j, i] = R[i, 2], p[i]
-            _move(R, p, q[n, j], slides[j])
+            _pass(R, p, transforms[j], q[n, j], slides[j], axis[j], origin[j])
             for i in range(3):
                 middle[j, i] = p[i]
                 for k in range(3):

@@ -113,14 +113,7 @@ def bridge(
     metavar="FOLDER",
     help="Folder of profiles (NAME.toml) beside those that come with failuretwin.",
 )
-@click.option(
-    "--false-alarms-per-100h",
-    "budget",
-    type=click.FloatRange(0.0, 1000.0, min_open=True),
-    default=1.0,
-    metavar="N",
-    help="Budget of false alarms in 100 hours of each robot.",
-)
+@opt.budget_option
 @click.option(
     "--snapshot",
     "snapshot_s",

@@ -42,14 +42,7 @@ PROBING = ("idle", "move", *opt.names_of(opt.SafetyOptions))
     "FILE.mcap",
     "Record readings, commands and diagnoses; Foxglove, PlotJuggler and failuretwin read it.",
 )
-@click.option(
-    "--false-alarms-per-100h",
-    "budget",
-    type=click.FloatRange(0.0, 1000.0, min_open=True),
-    default=1.0,
-    metavar="N",
-    help="Budget of false alarms in 100 hours of work. A smaller one delays alarms.",
-)
+@opt.budget_option
 @click.option(
     "--sensing",
     type=click.Choice(STREAMED),

@@ -212,6 +212,15 @@ topics_option = file_option(
     "Names and types of the robot's ROS topics, see docs/live.md. Default: those of the data "
     "set's authors.",
 )
+budget_option = click.option(
+    "--false-alarms-per-100h",
+    "budget",
+    type=click.FloatRange(0.0, 1000.0, min_open=True),
+    default=1.0,
+    metavar="N",
+    help="Budget of false alarms of a robot in 100 hours of work. A smaller one delays alarms.",
+)
+
 fault_option = click.option(
     "--fault",
     "faults",
