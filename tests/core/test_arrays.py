@@ -84,7 +84,7 @@ def test_what_is_put_is_what_is_taken(sample):
 
 
 def test_the_oldest_movement_is_forgotten(sample):
-    sample.forget_oldest(0)
+    sample.forget_oldest(np.array([0]))
     assert sample.within.start[0].tolist()[:2] == [1.0, 2.0]
     assert np.isnan(sample.within.start[0, 2])
     assert sample.seen.tolist() == [[False, True, False], [False, True, True]]

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 
@@ -66,6 +66,10 @@ class Movements(ArrayStruct):
             origin[:, m] = here
             here = here + (self.target[:, m] - here) * self._share_done(m)
         return origin
+
+    def since(self, number: int) -> Self:
+        """Return the movements from one on, as if a run began with it."""
+        return replace(self[:, number:], initial=self.origin()[:, number])
 
     def _share_done(self, m: int) -> FloatArray:
         """Return the completed share of ramp `m` when the next movement starts, (run, motor)."""

@@ -43,15 +43,6 @@ def log_of(values: ArrayLike) -> FloatArray:
         return np.log(as_floats(values))
 
 
-def log_trapezoid_weights(nodes: FloatArray) -> FloatArray:
-    """Return log weights of the trapezoidal rule on sorted `nodes` (..., node), same shape."""
-    steps = np.diff(nodes, axis=-1)
-    weights = np.zeros_like(nodes)
-    weights[..., :-1] += 0.5 * steps
-    weights[..., 1:] += 0.5 * steps
-    return log_of(weights)
-
-
 SAME_VALUE = 1e-9
 """Values that differ by a smaller share of their range are equal [-]."""
 

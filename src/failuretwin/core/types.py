@@ -125,12 +125,12 @@ class ArrayStruct:
 
         return self._with(joined)
 
-    def forget_oldest(self, run: int) -> None:
-        """Drop the first movement of a run; the last place becomes empty."""
+    def forget_oldest(self, runs: IntArray) -> None:
+        """Drop the first movement of some runs; the last place becomes empty."""
         for _, array, axes in self._arrays():
             if "movement" in axes.names:
-                array[run, :-1] = array[run, 1:].copy()
-                array[run, -1] = axes.empty
+                array[runs, :-1] = array[runs, 1:]
+                array[runs, -1] = axes.empty
 
     def to_arrays(self, prefix: str) -> dict[str, np.ndarray]:
         """Return all arrays by ``prefix/field``, and ``prefix/field/field`` for nested values."""

@@ -16,13 +16,11 @@ def test_a_window_takes_the_outcomes_of_another_robot(twin):
     usual = HealthyModel(twin, generic_imperfections(twin.robot))
     rare = [replace(e, rate=1e-6, rate_when_late=1e-6) for e in usual.imperfections.lost_commands]
     calm = replace(usual, imperfections=replace(usual.imperfections, lost_commands=tuple(rare)))
-    window = MovementWindow.of(usual, 2, 4)
-    window.judged[:] = True
-    after, fresh = window.looked_at_by(calm), MovementWindow.of(calm, 2, 4)
-    assert not after.judged.any()
+    window, robots = MovementWindow.of(usual, 2, 4), np.arange(2)
+    evidence = window.settled
     shapes = [
-        [one.first.density.shape, one.likelihoods.outcomes.log_weight.shape]
-        for one in (after, fresh, window)
+        window.judge(robots, evidence, model).outcomes.log_weight.shape
+        for model in (usual, calm, usual)
     ]
-    assert shapes[0] == shapes[1] != shapes[2]
-    assert np.shares_memory(after.settled.point, window.settled.point)
+    assert shapes[0] == shapes[2] != shapes[1]
+    assert len(window.looks) == 2

@@ -18,7 +18,7 @@ from failuretwin.core.numerics import log_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
 from failuretwin.decision.streaming.fleet import StreamingFleet
-from failuretwin.decision.streaming.monitor import candidates, mixture_of, part_of
+from failuretwin.decision.streaming.monitor import candidates, evidence_since, mixture_of
 from failuretwin.decision.streaming.set_up_watch import PROOF, is_held
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -71,12 +71,13 @@ class FleetMonitor:
 
         Robots with as many new movements are followed together.
         """
-        likelihood = self.fleet.weigh(robots)
+        self.fleet.note_rest(robots)
+        says = [self.fleet.weigh(robots, model) for model in self._models]
         count, before = self.fleet.remembered[robots], self.fleet.forgotten[robots]
         new = np.maximum(self._movements[robots] - before, 0)
         for begin, end in np.unique(np.stack([new, count], axis=1), axis=0):
             rows = np.flatnonzero((new == begin) & (count == end))
-            self._advance(likelihood[rows], robots[rows], int(begin), int(end))
+            self._advance([one[rows] for one in says], robots[rows], int(begin), int(end))
 
     def alarm(self, robot: int) -> Alarm:
         """Return the alarm of a robot.
@@ -102,21 +103,22 @@ class FleetMonitor:
         told = log_of(self._mixture.posterior(belief)[0]), np.zeros(shape)
         return self.fleet.diagnosis(robot, told=told)
 
-    def _advance(self, likelihood: RunLikelihood, robots: IntArray, begin: int, end: int) -> None:
+    def _advance(
+        self, likelihoods: Sequence[RunLikelihood], robots: IntArray, begin: int, end: int
+    ) -> None:
         """Follow the movements from `begin` to `end` of some robots; the last is the present one.
 
         Movements that are over are counted once and for all; the present one as it looks now.
         """
-        part = slice(max(begin - 1, 0), end)
         says = [
-            one.evidence(part_of(likelihood, model, part))
-            for one, model in zip(self._mixture.filters, self._models, strict=True)
+            evidence_since(one, likelihood, begin)
+            for one, likelihood in zip(self._mixture.filters, likelihoods, strict=True)
         ]
         belief, hours = self._concluded[robots], np.zeros(len(robots))
         for movement in range(begin, end):
-            belief = self._mixture.advance(belief, says, movement - part.start)
+            belief = self._mixture.advance(belief, says, movement - begin)
             if movement < end - 1:
-                hours += says[0].hours[:, movement - part.start]
+                hours += says[0].hours[:, movement - begin]
                 self._concluded.put(robots, belief)
                 self._movements[robots] = self.fleet.forgotten[robots] + movement + 1
         self._present.put(robots, belief)

@@ -37,6 +37,7 @@ from failuretwin.inference.explanation import worded
 from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.log_quality import LogQuality
 from failuretwin.inference.observation.rounding import Rounding, rounded
 from failuretwin.inference.posterior import (
@@ -123,7 +124,8 @@ class StreamingFleet:
         self._zero = np.full(robots, np.nan)
         self._now = np.full(robots, -np.inf)
         self._settings = model.settings
-        self._tracker = MovementTracker(model, robots, movements, rate_hz)
+        notes_way = diagnoser.uses_transients
+        self._tracker = MovementTracker(model, robots, movements, rate_hz, notes_way)
         self._frozen = FrozenSensorDetector.empty(run=robots, axis=3, value=4, motor=motors)
         self._untold = UntoldMotion.empty(run=robots, axis=3)
         self._split = TwoPlaces.empty(run=robots, axis=3)
@@ -252,8 +254,7 @@ class StreamingFleet:
         What comes after it is a new beginning for the movement that was under way.
         """
         tracker = self._tracker
-        for robot in np.flatnonzero(tracker.references.moved):
-            tracker.find_movements(int(robot))
+        tracker.find_movements(np.flatnonzero(tracker.references.moved))
         there = np.flatnonzero(tracker.window.count > 0)
         tracker.conclude(there)
         self._judge(there, _as_recorded)
@@ -315,19 +316,21 @@ class StreamingFleet:
         found, at, position = self._found(robot)
         return found.likelihood[at], position
 
-    def weigh(self, robots: IntArray) -> RunLikelihood:
-        """Return what the last movements of some robots say, a run each, as they look by now.
+    def weigh(self, robots: IntArray, model: HealthyModel) -> RunLikelihood:
+        """Return what the last movements of some robots say by a model, a run each."""
+        window = self._tracker.window
+        settled, _ = window.evidence(robots)
+        return RunLikelihood(settled, model, remembered=window.judge(robots, settled, model))
+
+    def note_rest(self, robots: IntArray) -> None:
+        """Take the last movements of some robots as judged, as they look by now.
 
         For a filter of all movements; what this stream itself believes is left as it was.
         """
-        window = self._tracker.window
         for robot in robots.tolist():
-            self._tracker.see_on_way(robot, int(window.count[robot]) - 1)
-        settled, _ = window.evidence(robots)
-        likelihoods = window.judge(robots, settled, self.model)
+            self._tracker.see_on_way(robot, int(self._tracker.window.count[robot]) - 1)
         self._beliefs.judged[robots], self._latest = True, {}
         self._beliefs.point[robots] = self._resting(robots)
-        return RunLikelihood(settled, self.model, remembered=likelihoods)
 
     @property
     def remembered(self) -> IntArray:
@@ -414,7 +417,10 @@ class StreamingFleet:
         return own
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return all that the stream knows, by name; the first axis is the robot."""
+        """Return all that the stream knows, by name; the first axis is the robot.
+
+        What movements say is left out: it is computed anew.
+        """
         found = {"zero": self._zero, "now": self._now} | self._tracker.samples.state()
         for name, part in self._parts.items():
             found |= part.to_arrays(name)
@@ -432,6 +438,7 @@ class StreamingFleet:
         self._latest = {}
         for name, part in self._parts.items():
             part[known].from_arrays(name, state)
+        self._tracker.window.looks.clear()
         self._tracker.samples.restore(state)
 
     @property

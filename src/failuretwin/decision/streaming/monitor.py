@@ -34,13 +34,15 @@ from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.rounding import rounded, told_of
 from failuretwin.inference.posterior import StreamPosition
-from failuretwin.inference.together.fault_filter import FaultFilter
+from failuretwin.inference.together.fault_filter import FaultEvidence, FaultFilter
 from failuretwin.inference.together.healthy_mixture import FOREIGN, HealthyMixture
 from failuretwin.inference.together.life_filter import LifeFilter
 
 WORTH_LEARNING = 0.01
 """Probability that the calibration that was given is not this robot's from which it learns."""
 
+FIRST = np.array([0])
+"""The only robot of its stream."""
 UNHEARD = 3
 """Commands in a row of which a motor reports that they did not arrive, from which it is told."""
 BEGINS_ODDLY = (
@@ -225,18 +227,17 @@ class FaultMonitor(RobotStream):
         count, before = likelihood.usable.shape[1], position.movements
         self._arrived = likelihood.evidence.arrived[0]
         new = max(self._movements - before, 0)
-        part = slice(max(new - 1, 0), count)
         says = [
-            one.evidence(part_of(likelihood, model, part))
+            evidence_since(one, self._fleet.weigh(FIRST, model), new)
             for one, model in zip(self._mixture.filters, self._models, strict=True)
         ]
         belief, hours = self._concluded, 0.0
         self._explained = {m: v for m, v in self._explained.items() if m >= before}
         for movement in range(new, count):
-            belief = self._mixture.advance(belief, says, movement - part.start)
+            belief = self._mixture.advance(belief, says, movement - new)
             self._explained[before + movement] = float(belief.explained[0])
             if movement < count - 1:
-                hours += float(says[0].hours[0, movement - part.start])
+                hours += float(says[0].hours[0, movement - new])
                 self._concluded, self._movements = belief, before + movement + 1
         self._present = belief
         posterior = self._mixture.posterior(belief)[0]
@@ -254,12 +255,9 @@ class FaultMonitor(RobotStream):
         if self._learner is None:
             return
         own = float(np.exp(self._concluded.log_weight[0, -1]))
-        one, stood = evidence[(slice(None), slice(movement, movement + 1))], evidence.movements
-        told = replace(
-            one.movements,
-            initial=stood.origin()[:, movement],
-            start=one.movements.start + begin_s,
-        )
+        one = evidence[:, movement : movement + 1]
+        told = evidence.movements.since(movement)[:, :1]
+        told = replace(told, start=told.start + begin_s)
         if self._learner.take(replace(one, movements=told), learns=own > WORTH_LEARNING):
             self._models[-1] = rounded(self._learner.model, self._fleet.rounding, None)
             if own > 0.5:
@@ -291,14 +289,13 @@ def mixture_of(models: Sequence[HealthyModel], diagnoser: BayesDiagnoser) -> Hea
     return HealthyMixture(filters, np.array(share))
 
 
-def part_of(likelihood: RunLikelihood, model: HealthyModel, part: slice) -> RunLikelihood:
-    """Return what some of the last movements say by a model."""
-    if model is not likelihood.model:
-        likelihood = RunLikelihood(likelihood.evidence, model)
-    rows = slice(None), part
-    evidence, findings = likelihood.evidence, likelihood.findings
-    healthy = healthy_log_density(evidence, findings)[rows]
-    return RunLikelihood(evidence[rows], model, remembered=findings[rows], healthy=healthy)
+def evidence_since(faults: FaultFilter, likelihood: RunLikelihood, movement: int) -> FaultEvidence:
+    """Return what the last movements say of each fault, from one of them on."""
+    findings, before = likelihood.findings, min(movement, 1)
+    healthy = np.zeros(likelihood.usable.shape)
+    healthy[:, movement:] = healthy_log_density(likelihood.evidence, findings, movement)
+    told = replace(likelihood, healthy=healthy, remembered=findings)
+    return faults.evidence(told.since(movement - before), before)
 
 
 def monitor(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -104,11 +105,17 @@ class MovementTracker:
     """What is known of the last movements of many robots.
 
     `movements` are remembered of each robot, the present one included. `rate_hz` is the true rate
-    of the tool sensors [Hz]; None: all readings are real.
+    of the tool sensors [Hz]; None: all readings are real. `notes_way`: whether readings on the way
+    are kept.
     """
 
     def __init__(
-        self, model: HealthyModel, robots: int, movements: int, rate_hz: float | None
+        self,
+        model: HealthyModel,
+        robots: int,
+        movements: int,
+        rate_hz: float | None,
+        notes_way: bool,
     ) -> None:
         motors = len(model.scatter)
         self._sensors = model.sensors
@@ -117,12 +124,12 @@ class MovementTracker:
         self.window = MovementWindow.of(model, robots, movements)
         self._twin, self._settings = model.twin, model.settings
         self._least_step = 0.0 if rate_hz is None else 0.9 / rate_hz
+        self._notes_way = notes_way
         self._latest_start_s, self._late_after_s = _lateness(model)
 
     def adopt(self, model: HealthyModel) -> None:
-        """Judge all movements anew, by another healthy robot."""
+        """See movements as those of another healthy robot."""
         self._latest_start_s, self._late_after_s = _lateness(model)
-        self.window = self.window.looked_at_by(model)
 
     def take(
         self, time: FloatArray, command: FloatArray, points: FloatArray, away: BoolArray
@@ -142,8 +149,7 @@ class MovementTracker:
         """
         self.samples.add(time, command, points)
         begun = self.references.see(time, command)
-        for robot in begun:
-            self.find_movements(int(robot))
+        self.find_movements(begun)
         read = np.flatnonzero(np.isfinite(points).all(axis=1))
         self.window.read_s[read] = np.maximum(self.window.read_s[read], time[read])
         return begun, self.look(read[~away[read]])
@@ -162,7 +168,7 @@ class MovementTracker:
         arrived = np.where(np.isfinite(arrived), arrived, before)
         news = ~((arrived == before) | np.isnan(arrived)).all(axis=1)
         window.settled.arrived[at] = arrived
-        window.judged[at[0][news], at[1][news]] = False
+        window.renew((at[0][news], at[1][news]))
         return some[news]
 
     def rest(self) -> FloatArray:
@@ -186,17 +192,22 @@ class MovementTracker:
         with np.errstate(invalid="ignore"):
             return np.asarray(there & (time - now.start > lasts))
 
-    def find_movements(self, robot: int) -> None:
-        """Add the movements of a reference, up to now."""
-        movements, window = self.references.movements(robot, self.samples), self.window
-        if np.isnan(window.zero_s[robot]):
-            window.zero_s[robot] = self.samples.time(robot)[0]
-        for number, start in enumerate(movements.start[0]):
-            if window.count[robot] > 0:
-                last = int(window.count[robot]) - 1
-                self._settle((np.array([robot]), np.array([last])), np.array([start]))
-                self.see_on_way(robot, last)
-            window.append(robot, movements, number)
+    def find_movements(self, robots: IntArray) -> None:
+        """Add the movements of the references of some robots, up to now."""
+        window, samples = self.window, self.samples
+        fresh = robots[np.isnan(window.zero_s[robots])]
+        window.zero_s[fresh] = [samples.time(robot)[0] for robot in fresh.tolist()]
+        each = [self.references.movements(robot, samples) for robot in robots.tolist()]
+        count = np.array([found.start.shape[1] for found in each], dtype=np.int64)
+        for number in range(count.max(initial=0)):
+            some = np.flatnonzero(count > number)
+            rows, one = robots[some], _joined([each[i].since(number)[:, :1] for i in some])
+            later = window.count[rows] > 0
+            last = rows[later], window.count[rows[later]] - 1
+            self._settle(last, one.start[later, 0])
+            for robot, place in zip(*(part.tolist() for part in last), strict=True):
+                self.see_on_way(robot, place)
+            window.append(rows, one)
 
     def look(self, robots: IntArray) -> IntArray:
         """See where tools rest by now and return the robots whose tools do.
@@ -227,6 +238,8 @@ class MovementTracker:
     def see_on_way(self, robot: int, place: int) -> None:
         """Note what was read on the way of a movement, until the tool rested."""
         self._resume(robot, place)
+        if not self._notes_way:
+            return
         settled, at = self.window.settled, (robot, place)
         start, until = settled.movements.start[at], settled[at].transient_until
         some = self.samples.since(robot, float(start))
@@ -260,7 +273,8 @@ class MovementTracker:
         """Return robots that may be at rest, their movements, and when to look [s]."""
         settled, now = self.window.settled, self.window.settled.movements[at]
         begin = rest_begin(now.start, now.ramp_duration, end)
-        settled.begin[at], settled.end[at], self.window.judged[at] = begin, end, False
+        settled.begin[at], settled.end[at] = begin, end
+        self.window.renew(at)
         over = begin < end
         return (at[0][over], at[1][over]), begin[over], end[over]
 
@@ -304,6 +318,12 @@ class MovementTracker:
         unmoved = np.linalg.norm(point - rested, axis=1) < self._settings.unmoved_m
         since = self.window.read_s[robots] - known.start[at]
         return np.asarray(unmoved & (since < self._latest_start_s))
+
+
+def _joined(runs: Sequence[Movements]) -> Movements:
+    """Return movements of single runs as those of many."""
+    parts = ([run.initial, run.target, run.ramp_duration, run.start] for run in runs)
+    return Movements(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def _lateness(model: HealthyModel) -> tuple[float, float]:

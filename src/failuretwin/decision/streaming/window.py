@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
@@ -24,6 +24,43 @@ from failuretwin.inference.observation.healthy_model import Explanation, Healthy
 
 
 @dataclass(frozen=True)
+class MovementLook(ArrayStruct):
+    """What a model says of the last movements of each robot.
+
+    Attributes:
+        first: How well outcomes explain each movement if motors stood as commanded before it.
+        judged: Movements of which all is up to date, (robot, movement).
+        likelihoods: What every movement says by itself.
+    """
+
+    first: Explanation
+    judged: Annotated[BoolArray, Axes("run", "movement", empty=False)]
+    likelihoods: MovementLikelihoods
+
+    def judge(self, robots: IntArray, evidence: SettledEvidence) -> None:
+        """Look anew at the movements of some robots that are not judged."""
+        some, known, model = _first_of(robots, evidence), self.likelihoods, self.likelihoods.model
+        run, movement = np.nonzero(evidence.movements.exists & ~self.judged[some])
+        if len(run) == 0:
+            return
+        item, at = (run[:, None], movement[:, None]), (robots[run][:, None], movement[:, None])
+        single, usual = evidence[item], model.outcomes(evidence.movements)
+        self.first.put(at, model.explain(single, usual[item]))
+        seen = model.outcomes_as_seen(evidence, self.first[some])
+        explanation = model.explain(single, seen[item])
+        known.explanation.put(at, explanation)
+        density = known.explanation.density[some]
+        alone = model.filtered_outcomes(evidence, seen, density)[item]
+        profiles = joint_likelihoods(single, model, alone, range(len(model.scatter)))
+        known.put(at, MovementLikelihoods(model, alone, explanation, tuple(profiles)))
+        self.judged[at] = True
+
+
+MOST_LOOKS = 2
+"""Models whose looks are kept: the calibration that is given, and one more."""
+
+
+@dataclass(frozen=True)
 class MovementWindow(ArrayStruct):
     """The last movements of each robot, oldest first; a robot is what a run is in a recording.
 
@@ -36,9 +73,7 @@ class MovementWindow(ArrayStruct):
         read_s: When the tool was last read, (robot,) [s].
         settled: Where the tools settled.
         transient: What was read on the way.
-        first: How well outcomes explain each movement if motors stood as commanded before it.
-        judged: Movements of which `first` and `likelihoods` are up to date, (robot, movement).
-        likelihoods: What every movement says by itself.
+        looks: What the models that were asked last say; it can be computed anew.
     """
 
     count: Annotated[IntArray, Axes("run", empty=0)]
@@ -47,64 +82,50 @@ class MovementWindow(ArrayStruct):
     read_s: Annotated[FloatArray, Axes("run", empty=-np.inf)]
     settled: SettledEvidence
     transient: TransientSamples
-    first: Explanation
-    judged: Annotated[BoolArray, Axes("run", "movement", empty=False)]
-    likelihoods: MovementLikelihoods
+    looks: list[MovementLook] = field(default_factory=list)
 
     @classmethod
     def of(cls, model: HealthyModel, robots: int, movements: int) -> MovementWindow:
         """Return windows of so many movements at most, without any yet."""
-        channels = model.sensors.channels
-        sizes = {"motor": len(model.scatter), "axis": channels, "reading": MOST_READINGS}
-        settled = SettledEvidence.empty(run=0, movement=movements, **sizes)
-        likelihoods = movement_likelihoods(settled, model)
-        none = cls(
-            count=np.zeros(0, dtype=np.int64),
-            forgotten=np.zeros(0, dtype=np.int64),
-            zero_s=np.zeros(0),
-            read_s=np.zeros(0),
-            settled=settled,
-            transient=TransientSamples.empty(run=0, movement=movements, **sizes),
-            judged=np.zeros((0, movements), dtype=bool),
-            first=likelihoods.explanation,
-            likelihoods=likelihoods,
-        )
-        return none.blank(robots, movements)
+        sizes = {"motor": len(model.scatter), "axis": model.sensors.channels}
+        return cls.empty(run=robots, movement=movements, reading=MOST_READINGS, **sizes)
 
-    def looked_at_by(self, model: HealthyModel) -> MovementWindow:
-        """Return the same, nothing judged: another healthy robot may have other outcomes."""
-        judged = np.zeros_like(self.judged)
-        likelihoods = movement_likelihoods(self.settled[:0], model).blank(*judged.shape)
-        first = likelihoods.explanation.blank(*judged.shape)
-        return replace(self, first=first, likelihoods=likelihoods, judged=judged)
+    def renew(self, at: tuple[IntArray, IntArray]) -> None:
+        """Note that something new was seen of some movements, (robot, movement)."""
+        for look in self.looks:
+            look.judged[at] = False
 
-    def append(self, robot: int, movements: Movements, number: int) -> None:
-        """Add a movement of a robot; where there is no room, the oldest is forgotten.
+    def append(self, robots: IntArray, movements: Movements) -> None:
+        """Add a movement of some robots; where there is no room, the oldest is forgotten.
 
-        It is one of the movements of a single run, by the time of the stream.
+        Movements are a run each, of one movement, by the time of the stream.
         """
         known = self.settled.movements
-        if self.count[robot] == known.start.shape[1]:
-            self.forget_oldest(robot)
-        place = int(self.count[robot])
-        first = movements.origin()[0, number] if place == 0 else known.initial[robot].copy()
-        known.put((robot, place), movements[0, number])
-        known.initial[robot] = first
-        self.count[robot] += 1
+        self.forget_oldest(robots[self.count[robots] == known.start.shape[1]])
+        place = self.count[robots]
+        first = np.where(place[:, None] == 0, movements.initial, known.initial[robots])
+        known.put((robots, place), movements[:, 0])
+        known.initial[robots] = first
+        self.count[robots] += 1
 
-    def forget_oldest(self, run: int) -> None:
-        """Drop the oldest movement of a robot."""
-        known = self.settled.movements
-        if self.count[run] > 1:
-            known.initial[run] = known[[run], : self.count[run]].origin()[0, 1]
-        super().forget_oldest(run)
-        self.zero_s[run] = known.start[run, 0]
-        self.count[run] -= 1
-        self.forgotten[run] += 1
+    def forget_oldest(self, runs: IntArray) -> None:
+        """Drop the oldest movement of some robots."""
+        if len(runs) == 0:
+            return
+        known, longer = self.settled.movements, runs[self.count[runs] > 1]
+        if len(longer):
+            known.initial[longer] = known[longer, :2].origin()[:, 1]
+        super().forget_oldest(runs)
+        for look in self.looks:
+            look.forget_oldest(runs)
+        self.zero_s[runs] = known.start[runs, 0]
+        self.count[runs] -= 1
+        self.forgotten[runs] += 1
 
     def evidence(self, robots: IntArray) -> tuple[SettledEvidence, TransientSamples]:
         """Return what was seen of some robots; times count from `zero_s`."""
-        some, zero = self._of(robots), self.zero_s[robots, None]
+        some = robots, slice(0, int(self.count[robots].max(initial=0)))
+        zero = self.zero_s[robots, None]
         settled = self.settled[some]
         movements = replace(settled.movements, start=settled.movements.start - zero)
         begin, end = settled.begin - zero, settled.end - zero
@@ -114,25 +135,28 @@ class MovementWindow(ArrayStruct):
         self, robots: IntArray, evidence: SettledEvidence, model: HealthyModel
     ) -> MovementLikelihoods:
         """Return what the last movements of some robots say, looking anew at what is not judged."""
-        some, usual = self._of(robots), model.outcomes(evidence.movements)
-        run, movement = np.nonzero(evidence.movements.exists & ~self.judged[some])
-        if len(run):
-            item, at = (run[:, None], movement[:, None]), (robots[run][:, None], movement[:, None])
-            single, known = evidence[item], self.likelihoods
-            self.first.put(at, model.explain(single, usual[item]))
-            seen = model.outcomes_as_seen(evidence, self.first[some])
-            explanation = model.explain(single, seen[item])
-            known.explanation.put(at, explanation)
-            density = known.explanation.density[some]
-            alone = model.filtered_outcomes(evidence, seen, density)[item]
-            profiles = joint_likelihoods(single, model, alone, range(len(model.scatter)))
-            known.put(at, MovementLikelihoods(model, alone, explanation, tuple(profiles)))
-            self.judged[at] = True
-        return self.likelihoods[some]
+        look = self._look_of(model)
+        look.judge(robots, evidence)
+        return look.likelihoods[_first_of(robots, evidence)]
 
-    def _of(self, robots: IntArray) -> tuple[IntArray, slice]:
-        """Return some robots and as many movements as any of them has."""
-        return robots, slice(0, int(self.count[robots].max(initial=0)))
+    def _look_of(self, model: HealthyModel) -> MovementLook:
+        """Return the look of a model; it is the newest from now on."""
+        looks = self.looks
+        known = [look for look in looks if look.likelihoods.model is model]
+        if not known:
+            likelihoods = movement_likelihoods(self.settled[:0], model)
+            shape = self.settled.usable.shape
+            judged = np.zeros(shape, dtype=bool)
+            first = likelihoods.explanation.blank(*shape)
+            known = [MovementLook(first, judged, likelihoods.blank(*shape))]
+        others = [look for look in looks if look is not known[0]]
+        looks[:] = [*others, *known][-MOST_LOOKS:]
+        return known[0]
+
+
+def _first_of(robots: IntArray, evidence: SettledEvidence) -> tuple[IntArray, slice]:
+    """Return some robots and as many movements as there is evidence of."""
+    return robots, slice(0, evidence.usable.shape[1])
 
 
 # The samples of the last seconds, each robot by its own times.

@@ -13,9 +13,12 @@ Section: docs/inference.md#hypotheses
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from failuretwin.core.numerics import log_fall, log_norm, log_of, log_sum, log_trapezoid_weights
+from failuretwin.core.compiled import compiled
+from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.faults.fault_sizes import nodes_around
 from failuretwin.inference.faults.marginal import FaultModel
@@ -30,9 +33,10 @@ PRIOR_STEPS = np.array([-5, -2.5, -1, 0, 1, 2.5, 5.0])
 """Nodes around each angle that the prior favours, in the scale of its peak."""
 SETTLED_SCALE, ON_THE_WAY_SCALE = 2.0, 8.0
 """How sharply the prior ties the held angle to where the motor had settled, and to where its ramp
-was at a known onset, in scatters of the motor."""
-TIED_DOF = 4.0
-"""Degrees of freedom of that prior: heavy tails."""
+was at a known onset, in scatters of the motor: scales of a Student t of four degrees of freedom,
+p(x) = 3/8 (1 + x^2 / 4)^(-5/2)."""
+MARGIN = 4.0
+"""How far beyond the ends of its ramp a motor may stick on it, in its scatters."""
 FREE_IF_KNOWN = 0.05
 """Probability that the held angle is unrelated to the commands where the onset is known."""
 
@@ -131,7 +135,7 @@ def _log_prior(
 
     Each interval has its share of the prior.
     """
-    mass = held_prior(likelihood, motor, angle, prior)
+    mass = log_of(held_prior(likelihood, motor, angle, prior))
     intervals = stuck_intervals(likelihood, motor)
     if prior.known_s is not None:
         return mass + log_of(intervals.holding(prior.known_s))[..., None]
@@ -141,7 +145,7 @@ def _log_prior(
 def held_prior(
     likelihood: RunLikelihood, motor: int, angle: FloatArray, prior: OnsetPrior
 ) -> FloatArray:
-    """Return log p(held angle | onset in an interval), (run, movement, plateau | ramp, node).
+    """Return p(held angle | onset in an interval), (run, movement, plateau | ramp, node).
 
     The nodes carry the density of the angle times the weights of the trapezoidal rule, normalised
     so that no mass is lost between nodes.
@@ -154,29 +158,54 @@ def held_prior(
     """
     origin, target = _ends(likelihood, motor)
     scale = max(float(likelihood.model.scatter[motor]), 1e-4)
-    low, high = (end[:, None, None, None] for end in likelihood.held_range(motor))
-    plateau = _tied(angle[:, None] - origin[..., None], SETTLED_SCALE * scale)
+    way = np.full_like(origin, np.nan)
     if prior.known_s is not None:
         way = _position_at(likelihood, motor, prior.known_s)
-        ramp = _tied(angle[:, None] - way[..., None], ON_THE_WAY_SCALE * scale)
-    else:
-        ramp = _between(angle[:, None], origin[..., None], target[..., None], 4.0 * scale)
-    tied = np.stack([plateau, ramp], axis=2)
-    share = FREE_IF_KNOWN if prior.known_s is not None else prior.free
-    mixed = np.logaddexp(np.log1p(-share) + tied, np.log(share) - np.log(high - low))
-    mass = mixed + log_trapezoid_weights(angle)[:, None, None]
-    return np.asarray(mass - log_sum(mass, axis=-1)[..., None])
+    free = FREE_IF_KNOWN if prior.known_s is not None else prior.free
+    low, high = likelihood.held_range(motor)
+    found = np.empty((*origin.shape, 2, angle.shape[1]))
+    ends = np.stack([origin, target, way])
+    _write_held_prior(np.ascontiguousarray(angle), ends, high - low, scale, free, found)
+    return found
 
 
-def _tied(off: FloatArray, scale: float) -> FloatArray:
-    """Return the log density of a held angle that is off by `off` from where it is tied to."""
-    return log_norm(TIED_DOF, dims=1) - np.log(scale) + log_fall((off / scale) ** 2, TIED_DOF, 1)
+@compiled
+def _write_held_prior(
+    angle: FloatArray,
+    ends: FloatArray,
+    width: FloatArray,
+    scale: float,
+    free: float,
+    found: FloatArray,
+) -> None:
+    """Write `held_prior`; where the place on the way is not known, any on it is as likely.
 
-
-def _between(x: FloatArray, a: FloatArray, b: FloatArray, margin: float) -> FloatArray:
-    """Return the log density of being anywhere between `a` and `b`, give or take `margin`."""
-    low, high = np.minimum(a, b) - margin, np.maximum(a, b) + margin
-    return np.where((x >= low) & (x <= high), -np.log(high - low), -np.inf)
+    Ends of the ramps and the place between them where the motor stuck are (3, run, movement) [rad],
+    the range of held angles (run,) [rad], the scatter a scale [rad].
+    """
+    runs, movements, _, nodes = found.shape
+    for r in range(runs):
+        for m in range(movements):
+            origin, target, way = ends[0, r, m], ends[1, r, m], ends[2, r, m]
+            low, high = min(origin, target) - MARGIN * scale, max(origin, target) + MARGIN * scale
+            for part in range(2):
+                ramp = part == 1 and math.isnan(way)
+                centre = way if part == 1 else origin
+                unit = scale * (ON_THE_WAY_SCALE if part == 1 else SETTLED_SCALE)
+                total = 0.0
+                for n in range(nodes):
+                    phi = angle[r, n]
+                    if ramp:
+                        tied = 1.0 / (high - low) if low <= phi <= high else 0.0
+                    else:
+                        fall = 1.0 + 0.25 * ((phi - centre) / unit) ** 2
+                        tied = 0.375 / (unit * fall * fall * math.sqrt(fall))
+                    step = angle[r, min(n + 1, nodes - 1)] - angle[r, max(n - 1, 0)]
+                    mass = 0.5 * step * ((1.0 - free) * tied + free / width[r])
+                    found[r, m, part, n] = mass
+                    total += mass
+                for n in range(nodes):
+                    found[r, m, part, n] /= total
 
 
 def _position_at(likelihood: RunLikelihood, motor: int, onset_s: float) -> FloatArray:

@@ -43,18 +43,23 @@ LEAST = 1e-18
 """Least variance of a motor [rad2]: one that is ideal has none."""
 
 
-def healthy_log_density(evidence: SettledEvidence, found: MovementLikelihoods) -> FloatArray:
+def healthy_log_density(
+    evidence: SettledEvidence, found: MovementLikelihoods, since: int = 0
+) -> FloatArray:
     """Return the log density of each settled position of a healthy robot, (run, movement).
 
     Args:
         evidence: Settled positions.
         found: What every movement says by itself.
+        since: Number of the first movement that is asked for.
 
     Returns:
         [log 1/m^dims]; 0 where nothing was seen.
     """
-    model, outcomes = found.model, found.outcomes
-    mean, deviation = _Stays.of(evidence, found).kept(model, outcomes)
+    model, asked = found.model, (slice(None), slice(since, None))
+    kept = _Stays.of(evidence, found).kept(model, found.outcomes)
+    mean, deviation = (part[asked] for part in kept)
+    outcomes, evidence = found.outcomes[asked], evidence[asked]
     possible = np.isfinite(outcomes.log_weight)
     base = (outcomes.base - outcomes.kept + mean)[possible]
     pose = model.settle(base, outcomes.direction[possible], model.none_held)

@@ -16,12 +16,14 @@ Section: docs/inference.md#likelihood
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
+from failuretwin.core.compiled import compiled
 from failuretwin.core.numerics import log_fall
 from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray
 from failuretwin.inference.observation.command_loss import CommandOutcomes
@@ -34,8 +36,8 @@ LONGEST_STEP_RAD = 0.3
 """Bound on such a step: near a singular pose the parabola promises too much."""
 FURTHEST_OFF = 1.1
 """Share of its travel within which a motor may stand, on one side of its target."""
-NEGLIGIBLE_NATS = 9.0
-"""What lies this far below the tool being anywhere, wherever the motor stands, is left out."""
+NEGLIGIBLE_NATS = 12.0
+"""What lies this far below the tool being anywhere is left out."""
 LARGEST_OFFSET_RAD = 0.9
 """Furthest from its target that a motor is taken to have settled without being stuck [rad]; the
 largest encoder faults that are considered."""
@@ -120,25 +122,19 @@ class JointLikelihood(ArrayStruct):
             (..., node) [log 1/m3]; 0 for movements that are not usable.
         """
         precision, log_weight = self._with_scatter(held)
-        lead = log_weight.shape[:-1]
-        angle = np.broadcast_to(angle, (*lead, *angle.shape[-2:]))
-        total = np.ones((*lead, angle.shape[-2]))
-        highest = log_weight + log_fall(self.min_distance2, self.dof, self.dims)
-        matters = highest > self.outlier - NEGLIGIBLE_NATS
-        # Alternative by alternative: large temporary arrays would cost more than the arithmetic.
-        for k in range(log_weight.shape[-1]):
-            some = matters[..., k]
-            if not some.any():
-                continue
-            at = angle[some, :, k if angle.shape[-1] > 1 else 0]
-            off = self.turned(at - self.mode[some, k, None])
-            off *= off
-            off *= precision[some, k, None]
-            off += self.min_distance2[some, k, None]
-            fall = log_fall(off, self.dof, self.dims)
-            fall += log_weight[some, k, None] - self.outlier
-            total[some] += np.exp(fall, out=fall)
-        found = self.outlier + np.log(total)
+        *lead, outcomes = log_weight.shape
+        nodes, own = angle.shape[-2:]
+        of_items = np.ascontiguousarray(np.broadcast_to(angle, (*lead, nodes, own)))
+        found = np.empty((*lead, nodes))
+        _write_log_density(
+            of_items.reshape(-1, nodes, own),
+            self.mode.reshape(-1, outcomes),
+            precision.reshape(-1, outcomes),
+            self.min_distance2.reshape(-1, outcomes),
+            log_weight.reshape(-1, outcomes),
+            (self.outlier, self.dof, self.dims, self.wraps),
+            found.reshape(-1, nodes),
+        )
         usable = self.usable.reshape(self.usable.shape + (1,) * (found.ndim - 2))
         return np.where(usable, found, 0.0)
 
@@ -155,6 +151,46 @@ class JointLikelihood(ArrayStruct):
         """Return precision and log weight once the motor's own scatter counts."""
         inflation = self.inflation(held)
         return self.precision / inflation, self.log_weight - 0.5 * np.log(inflation)
+
+
+@compiled
+def _write_log_density(
+    angle: FloatArray,
+    mode: FloatArray,
+    precision: FloatArray,
+    min_distance2: FloatArray,
+    log_weight: FloatArray,
+    constants: tuple[float, float, int, bool],
+    found: FloatArray,
+) -> None:
+    """Write log L of each settled position at each angle, (item, node); see `JointLikelihood`.
+
+    Angles are (item, node, outcome or 1) [rad], what outcomes say (item, outcome). Constants are
+    the log density of the tool being anywhere, degrees of freedom, dimensions, and whether angles
+    wrap.
+    """
+    outlier, dof, dims, wraps = constants
+    power, turn = -0.5 * (dof + dims), 2.0 * math.pi
+    for i in range(found.shape[0]):
+        found[i, :] = 1.0
+        for k in range(mode.shape[1]):
+            log_ratio, own = log_weight[i, k] - outlier, min(k, angle.shape[2] - 1)
+            room = log_ratio + NEGLIGIBLE_NATS
+            furthest = 2.0 * room if math.isinf(dof) else dof * math.expm1(-room / power)
+            if not min_distance2[i, k] < furthest:
+                continue
+            for n in range(found.shape[1]):
+                off = angle[i, n, own] - mode[i, k]
+                if wraps:
+                    off -= turn * np.rint(off / turn)
+                square = min_distance2[i, k] + precision[i, k] * off * off
+                if square < furthest:
+                    log_fall = (
+                        -0.5 * square if math.isinf(dof) else power * math.log1p(square / dof)
+                    )
+                    found[i, n] += math.exp(log_ratio + log_fall)
+        for n in range(found.shape[1]):
+            found[i, n] = outlier + math.log(found[i, n])
 
 
 def joint_likelihoods(

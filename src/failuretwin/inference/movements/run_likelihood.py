@@ -73,6 +73,17 @@ class RunLikelihood:
         """Return some of the runs alone, all seen at rest or all on the way."""
         return replace(self[runs], evidence=self.evidence.alike(runs))
 
+    def since(self, movement: int) -> RunLikelihood:
+        """Return the settled positions from one movement on, as if the runs began with it."""
+        seen, healthy = self.evidence[:, movement:], self.healthy
+        seen = replace(seen, movements=self.evidence.movements.since(movement))
+        return RunLikelihood(
+            seen,
+            self.model,
+            remembered=self.findings[:, movement:],
+            healthy=None if healthy is None else healthy[:, movement:],
+        )
+
     @cached_property
     def findings(self) -> MovementLikelihoods:
         """What every movement says by itself."""

@@ -156,40 +156,41 @@ class FaultFilter:
         """Return the belief that all is well."""
         return FaultBelief.empty(run=robots, node=len(self.held_of), cell=len(self._cell_of))
 
-    def evidence(self, likelihood: RunLikelihood) -> FaultEvidence:
+    def evidence(self, likelihood: RunLikelihood, since: int = 0) -> FaultEvidence:
         """Return what movements say of each fault.
 
         Args:
             likelihood: The movements of each robot. Of the first, what came before is the begin of
                 the run.
+            since: Number of the first movement that is asked for.
         """
-        healthy = likelihood.log_healthy[..., None]
-        held, begun, off, lasted = [], [], [], []
+        asked = likelihood.since(since) if since else likelihood
+        healthy = asked.log_healthy[..., None]
+        held, begun, off = [], [], []
         for fault, grid in zip(self._of(Signature.HELD), self._grids, strict=True):
             motor = motor_of(likelihood, fault)
-            profile, step = likelihood.profile(motor), grid[1] - grid[0]
+            profile, step = asked.profile(motor), grid[1] - grid[0]
             blurred = float(np.hypot(profile.held_scatter, DENSE * step))
             profile = replace(profile, held_scatter=blurred)
             held.append(profile.log_density(grid[:, None], True) - healthy)
-            length = stuck_intervals(likelihood, motor).length
+            length = stuck_intervals(likelihood, motor).length[:, since:]
             total = length.sum(axis=-1, keepdims=True)
             share = np.where(total > 0.0, length / np.where(total > 0.0, total, 1.0), 0.5)
             angle = np.broadcast_to(grid, (len(healthy), len(grid)))
-            mass = np.exp(held_prior(likelihood, motor, angle, self.priors.onset))
-            begun.append(np.einsum("rmi,rmin->rmn", share, mass))
-            lasted.append(total[..., 0])
+            mass = held_prior(likelihood, motor, angle, self.priors.onset)[:, since:]
+            begun.append((share[..., None, :] @ mass)[..., 0, :])
         for fault in self._of(Signature.REDRAWN_OFFSET):
             motor, mode = motor_of(likelihood, fault), MODES[fault.mode]
             sizes, early = self._sizes(fault), mode.before_run
-            model = redrawn_offset_model(likelihood, motor, mode, sizes, early)
-            off.append(movement_log_likelihoods(likelihood, model).by_cell - healthy)
+            model = redrawn_offset_model(asked, motor, mode, sizes, early)
+            off.append(movement_log_likelihoods(asked, model).by_cell - healthy)
         none = np.zeros((*healthy.shape[:2], 0))
         return FaultEvidence(
             np.concatenate([*held, none], axis=-1),
             np.concatenate([*off, none], axis=-1),
             np.concatenate([*begun, none], axis=-1),
-            self._hours(likelihood),
-            likelihood.log_healthy,
+            self._hours(likelihood)[:, since:],
+            asked.log_healthy,
         )
 
     def advance(self, belief: FaultBelief, seen: FaultEvidence, movement: int) -> FaultBelief:
