@@ -1,7 +1,8 @@
 """Evidence of whole runs, judged by importance sampling and by what is known of simulated arms."""
 
+import importlib
 from dataclasses import replace
-from math import lgamma
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,6 @@ from scipy.special import logsumexp
 
 import failuretwin as ft
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
-from failuretwin.core.numerics import log_fall, log_norm
 from failuretwin.core.runs import truth_of
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.arm_classes import generic_imperfections
@@ -19,12 +19,11 @@ from failuretwin.digital_model.nonidealities import Readings
 from failuretwin.digital_model.robot import _assembled, load_robot
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.moments import moments_of
-from failuretwin.inference.engine.picks import Part, Picks, prepared
 from failuretwin.inference.engine.posterior import marginal_likelihoods, theta_posterior
 from failuretwin.inference.engine.redrawn_rows import redrawn_rows
 from failuretwin.inference.engine.registration import robot_posterior
 from failuretwin.inference.engine.rows import Scene
-from failuretwin.inference.engine.runs import RunsEvidence, has_rows
+from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.engine.theta import (
     AS_TOLD,
     SINCE_CALIBRATED,
@@ -33,24 +32,21 @@ from failuretwin.inference.engine.theta import (
     layout_of,
     robot_components,
 )
-from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.together.folder_posterior import folder_posterior
 from failuretwin.inference.together.habits import Habits
 
+BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
 DRAWS = 20_000
 
 
-def evidence_of(runs, model, hypotheses, factors=AS_TOLD):
-    """The runs as the engine sees them, by their settled positions."""
-    seen = Evidence(runs, model.settings, model.sensors).sound
-    moments, sharp = moments_of(model, seen.settled), model.without_doubt
-    layout = layout_of(sharp)
-    components = robot_components(model, layout, factors)
-    scene = Scene.of(sharp, moments, ft.Priors(), layout, components.covariance[0])
-    return RunsEvidence(scene, hypotheses, components, log_prior(hypotheses, ft.Priors()))
+with pytest.MonkeyPatch.context() as patch:
+    patch.syspath_prepend(BENCHMARKS)
+    referee = importlib.import_module("referee")
+
+evidence_of = referee.evidence_of
 
 
 def probability(evidence):
@@ -69,62 +65,15 @@ def runs():
 @pytest.fixture(scope="module")
 def uncalibrated(runs):
     model = HealthyModel.of(load_calibration("generic"))
-    return evidence_of(runs, model, paper_hypotheses(model.motor_names))
-
-
-def sampled_evidence(part, found, row, rng):
-    """log p(run | row) by importance sampling of f, from a Student t about what was found."""
-    usable, noise = part.scene.moments.usable[part.picks.run], part.scene.noise
-    (mean, spread), channels = part.prior, part.scene.moments.point.shape[-1]
-    some = np.flatnonzero(np.repeat(usable[row], channels))
-    K = spread[row][np.ix_(some, some)]
-    K += 1e-9 * np.trace(K) / len(K) * np.eye(len(K))
-    W = np.zeros((mean[row].size,) * 2)
-    information, shifts = found.sites
-    for m, one in enumerate(information[row]):
-        W[m * channels : (m + 1) * channels, m * channels : (m + 1) * channels] = one
-    precision = np.linalg.inv(K) + W[np.ix_(some, some)]
-    prior_mean, shift = mean[row].ravel()[some], shifts[row].ravel()[some]
-    C = np.linalg.inv(precision)
-    centre = C @ (shift + np.linalg.solve(K, prior_mean))
-    root, dof, size = np.linalg.cholesky(0.5 * (C + C.T)), 6.0, len(some)
-    x = rng.normal(size=(DRAWS, size)) * np.sqrt(dof / rng.chisquare(dof, (DRAWS, 1))) * 1.1
-    f = centre + x @ root.T
-    log_q = lgamma((dof + size) / 2) - lgamma(dof / 2) - 0.5 * size * np.log(dof * np.pi)
-    log_q -= size * np.log(1.1) + np.log(np.diag(root)).sum()
-    log_q = log_q - 0.5 * (dof + size) * np.log1p((x**2).sum(axis=1) / 1.21 / dof)
-    off = f - prior_mean
-    log_p = -0.5 * np.sum(off @ np.linalg.inv(K) * off, axis=1)
-    log_p -= 0.5 * np.linalg.slogdet(2.0 * np.pi * K)[1]
-    whole = np.zeros((DRAWS, mean[row].size))
-    whole[:, some] = f
-    total = log_p - log_q
-    for m in np.flatnonzero(usable[row]):
-        residual, scale = (values[row] for values in part.outcomes_at(int(m)))
-        precision = np.linalg.inv(scale)
-        error = residual - whole[:, None, m * channels : (m + 1) * channels]
-        square = np.einsum("nai,aij,naj->na", error, precision, error)
-        fall = log_fall(square, noise.dof, channels) - 0.5 * np.linalg.slogdet(scale)[1]
-        terms = part.log_weight[row, m] + log_norm(noise.dof, channels) + fall
-        total += np.logaddexp(logsumexp(terms, axis=1), noise.log_outlier)
-    weight = np.exp(total - total.max())
-    deviation = weight.std() / weight.mean() / np.sqrt(DRAWS)
-    return logsumexp(total) - np.log(DRAWS), deviation
+    return evidence_of(runs, model, paper_hypotheses(model.motor_names), AS_TOLD)
 
 
 def test_evidence_of_likely_rows_is_that_of_importance_sampling(uncalibrated):
     rng, off = np.random.default_rng(0), []
     height = uncalibrated.by_hypothesis + uncalibrated.log_odds
-    best = height.argmax(axis=1)
-    for run, h in enumerate(best):
-        one, rows = uncalibrated.weighed[h], uncalibrated.rows[h]
-        mine = np.flatnonzero((one.picks.run == run) & (one.picks.component == 0))
-        row = int(one.picks.row[mine[one.log_evidence[mine].argmax()]])
-        picks = Picks(np.array([run]), np.array([row]), np.array([0]))
-        components = uncalibrated.components
-        part = Part(uncalibrated.scene, rows, picks, components, prepared(rows, components))
-        found = part.refined(part.filtered())
-        exact, deviation = sampled_evidence(part, found, 0, rng)
+    for run, h in enumerate(height.argmax(axis=1).tolist()):
+        part, found = referee.likeliest(uncalibrated, h, run)
+        exact, deviation = referee.sampled_evidence(part, found, DRAWS, rng)
         if deviation < 0.05:  # else sampling itself does not tell
             off.append(float(found.total[0]) - exact)
     assert len(off) >= 14
@@ -145,7 +94,7 @@ def test_a_known_robot_is_judged_as_by_the_product_of_its_movements():
     made = simulate(Plan(robot, runs_per_class=1, seed=8, imperfections=model.imperfections))
     known = replace(model, imperfections=replace(model.imperfections, variation=None))
     hypotheses = paper_hypotheses(model.motor_names)
-    told = evidence_of(made, known, hypotheses)
+    told = evidence_of(made, known, hypotheses, AS_TOLD)
     diagnoser = ft.BayesDiagnoser(known.twin, known.imperfections, hypotheses, whole_run=False)
     says = diagnoser.diagnose(made)
     exact = np.array([[d.posterior[str(h)] for h in hypotheses] for d in says])
@@ -196,7 +145,7 @@ def test_geometry_is_no_fault(misbuilt):
     hypotheses = [Hypothesis.parse("healthy")]
     hypotheses += [Hypothesis.parse(f"{name}:stuck") for name in robot.motor_names[:3]]
     hypotheses += [Hypothesis.parse(f"{robot.motor_names[1]}:steady_state_error")]
-    told = probability(evidence_of(made, model, hypotheses))
+    told = probability(evidence_of(made, model, hypotheses, AS_TOLD))
     assert (told.argmax(axis=1) == 0).sum() >= 11
 
 
@@ -272,7 +221,7 @@ def test_offsets_of_one_size_are_found_and_sized(mode):
     )
     made = simulate(plan)
     hypotheses = [Hypothesis.parse("healthy"), Hypothesis.parse(f"motor_2:{mode}")]
-    evidence = evidence_of(made, model, hypotheses)
+    evidence = evidence_of(made, model, hypotheses, AS_TOLD)
     told = probability(evidence)[:, 1]
     diagnoser = ft.BayesDiagnoser(model.twin, model.imperfections, hypotheses, whole_run=False)
     exact = np.array([d.posterior[str(hypotheses[1])] for d in diagnoser.diagnose(made)])
@@ -296,7 +245,7 @@ def test_onset_and_size_of_stuck_motors_and_errors():
     plan = Plan(robot, classes, runs_per_class=4, seed=6, imperfections=model.imperfections)
     made = simulate(plan)
     hypotheses = [Hypothesis.parse(name) for name in ("healthy", *classes)]
-    evidence = evidence_of(made, model, hypotheses)
+    evidence = evidence_of(made, model, hypotheses, AS_TOLD)
     weights = marginal_likelihoods(evidence)
     diagnoser = ft.BayesDiagnoser(model.twin, model.imperfections, hypotheses, whole_run=False)
     for run, exact in enumerate(diagnoser.diagnose(made)):
@@ -325,7 +274,7 @@ def test_theta_of_a_healthy_robot_is_inside_its_intervals():
         imperfections = replace(usual, settling=settling, variation=None, lost_commands=())
         made = simulate(Plan(robot, ["healthy"], 2, seed, imperfections=imperfections))
         model = HealthyModel.of(load_calibration("generic"))
-        evidence = evidence_of(made, model, [Hypothesis.parse("healthy")])
+        evidence = evidence_of(made, model, [Hypothesis.parse("healthy")], AS_TOLD)
         mean, covariance = theta_posterior(evidence)
         zeros = slice(7, 11)
         spread = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, zeros]
@@ -355,7 +304,7 @@ def test_a_run_is_judged_alone(runs, uncalibrated):
     """Rows are narrowed to the outcomes that they need, not to those that their neighbours do."""
     model = HealthyModel.of(load_calibration("generic"))
     for run in (0, 7, 12):
-        alone = evidence_of(runs.isel(run=[run]), model, uncalibrated.hypotheses)
+        alone = evidence_of(runs.isel(run=[run]), model, uncalibrated.hypotheses, AS_TOLD)
         np.testing.assert_allclose(
             alone.by_hypothesis[0], uncalibrated.by_hypothesis[run], rtol=1e-9, atol=1e-9
         )
