@@ -25,6 +25,8 @@ from failuretwin.inference.movements.run_likelihood import RunLikelihood
 
 RULE = ("hours", "passed", "unnamed")
 """What an alarm rule counts."""
+DERIVED = ("window/judged", "window/first/", "window/likelihoods/")
+"""State that `judge` computes again from the rest: two thirds of it."""
 
 
 class FleetMonitor:
@@ -127,11 +129,16 @@ class FleetMonitor:
     # State: arrays with a row for each robot, and the alarms as tables.
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return what is known of all robots, by name; the first axis is the robot."""
-        found = self.fleet.state() | {"movements": self._movements}
-        for name, belief in (("concluded", self._concluded), ("present", self._present)):
-            found |= belief.to_arrays(name)
-        return found
+        """Return what is known of all robots, by name; the first axis is the robot.
+
+        What `judge` computes again is left out: `DERIVED` and the belief in the present movement.
+        """
+        known = {
+            name: value
+            for name, value in self.fleet.state().items()
+            if not name.startswith(DERIVED)
+        }
+        return known | {"movements": self._movements} | self._concluded.to_arrays("concluded")
 
     def alarms(self) -> list[dict[str, Any]]:
         """Return the alarm of each robot, and what its rule counts, as a table."""
@@ -148,10 +155,11 @@ class FleetMonitor:
             ValueError: If something is of another shape.
         """
         known = len(alarms)
-        self.fleet.restore(state)
+        own = self.fleet.state().items()
+        derived = {name: value[:known] for name, value in own if name.startswith(DERIVED)}
+        self.fleet.restore(derived | dict(state))
         self._movements[:known] = state["movements"]
-        for name, belief in (("concluded", self._concluded), ("present", self._present)):
-            belief[:known].from_arrays(name, state)
+        self._concluded[:known].from_arrays("concluded", state)
         for rule, table in zip(self._rules[:known], alarms, strict=True):
             rule.alarm = from_table(Alarm, table["alarm"], "alarm")
             for name in RULE:
