@@ -133,7 +133,7 @@ class Broker:
 
         once = StreamConfig(
             name=ALARM_STREAM,
-            subjects=[f"{ALARM}.>"],
+            subjects=[f"{ALARM}.*.*.*.*"],  # not those of retained MQTT messages
             max_msgs_per_subject=1,
             discard=DiscardPolicy.NEW,
             discard_new_per_subject=True,
@@ -162,7 +162,8 @@ class Broker:
 
         with suppress(Error, OSError, TimeoutError):
             await self.client.flush(timeout=2)
-        await self.client.close()
+        with suppress(Error, OSError, TimeoutError):  # the server is gone
+            await self.client.close()
 
     async def publish_once(self, subject: str, data: bytes) -> bool:
         """Store a message unless its subject has one, and return whether it is new."""

@@ -140,8 +140,7 @@ class Worker:
             await self._look()
             with suppress(TimeoutError):
                 await asyncio.wait_for(stop.wait(), RENEW_S)
-        for holder in list(self._held.values()):
-            await self._release(holder)
+        await asyncio.gather(*map(self._release, list(self._held.values())))
         with suppress(Exception):
             await self.buckets.workers.delete(self.settings.name)
         self._computer.shutdown()
