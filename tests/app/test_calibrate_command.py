@@ -160,7 +160,7 @@ def test_the_report_is_one_page_that_needs_nothing_else(learned, listing):
     text = (folder / REPORT / "index.html").read_text()
     page = Page(text)
     assert page.open == page.unpaired == []
-    assert len(page.loaded) == 4
+    assert len(page.loaded) == 1
     for source in page.loaded:
         kind, _, data = source.partition(",")
         assert kind == "data:image/png;base64"
