@@ -17,14 +17,13 @@ from failuretwin.app.cli import cli
 from failuretwin.connection.fleet.broker import IN, Access, open_broker
 from failuretwin.connection.fleet.messages import (
     events_binary,
-    events_json,
     profile_json,
 )
 from failuretwin.connection.fleet.mqtt import Retained
 from failuretwin.connection.links.base import Reading
 from failuretwin.core.errors import InputError
 from failuretwin.decision.fleet import partition as partition_module
-from fleet_messages import PROFILE_OF
+from fleet_messages import PROFILE_OF, events_json
 from fleet_servers import Mosquitto, NatsServer
 from running_fleet import alarms, ask, health, start, uncovered, until, worker_thread
 

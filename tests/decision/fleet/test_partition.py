@@ -48,7 +48,7 @@ def test_how_many_come_at_once_changes_nothing(alone):
 
 def test_json_says_the_same_as_the_compact_form(alone):
     changes, _ = alone
-    assert decided(played(Partition(resolve), envelopes(json=True))) == decided(changes)
+    assert decided(played(Partition(resolve), envelopes(as_json=True))) == decided(changes)
 
 
 def test_a_snapshot_goes_on_as_if_there_were_none(alone):
