@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
+
+import numpy as np
 
 from failuretwin.app.arms import emulation_with, known_arm
 from failuretwin.app.fleet import resolver
@@ -11,9 +14,9 @@ from failuretwin.connection.fleet.emulated_fleet import EmulatedFleet
 from failuretwin.connection.fleet.messages import (
     ProfileMessage,
     events_binary,
-    events_json,
     profile_json,
 )
+from failuretwin.connection.links.base import CommandSent, Reading
 from failuretwin.decision.fleet.partition import EVENTS, PROFILE, Envelope
 from failuretwin.digital_model.robot import load_robot
 
@@ -21,6 +24,20 @@ FAULTS = ((), ("motor_3:stuck@8",), ("motor_2:steady_state_error@10-26",))
 SECONDS, ZERO_S = 40, 1.8e9
 PROFILE_OF = ProfileMessage("armpi_fpv")
 resolve = resolver(None)
+
+
+def events_json(events):
+    """Return readings and commands as a gateway writes them."""
+    readings = [one for one in events if isinstance(one, Reading) and np.isfinite(one.tool).all()]
+    table = {
+        "readings": [{"t": one.time, "tool": one.tool.tolist()} for one in readings],
+        "commands": [
+            {"t": one.time, "target": one.target.tolist(), "duration": one.duration.tolist()}
+            for one in events
+            if isinstance(one, CommandSent)
+        ],
+    }
+    return json.dumps(table).encode()
 
 
 @cache
@@ -42,9 +59,9 @@ def seconds(robots=3):
     return found
 
 
-def envelopes(robots=3, json=False):
+def envelopes(robots=3, as_json=False):
     """Return the messages of the fleet in the order of the server."""
-    packed = events_json if json else lambda events: events_binary(events, 4)
+    packed = events_json if as_json else lambda events: events_binary(events, 4)
     found = [
         Envelope(k + 1, ZERO_S, f"arm_{k}", PROFILE, profile_json(PROFILE_OF))
         for k in range(robots)

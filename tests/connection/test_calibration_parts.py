@@ -14,12 +14,13 @@ from failuretwin.connection.calibration.parameters import (
     glitch_rates,
     loss_rates,
     median_interval,
+    settling_parameters,
     spread_of,
+    spring_remarks,
 )
 from failuretwin.connection.calibration.settling_fit import (
     best_payload,
     fit_settling,
-    sense_remarks,
 )
 from failuretwin.connection.calibration.timing_fit import (
     Transients,
@@ -430,44 +431,16 @@ def test_two_runs_tell_no_timing(armpi):
 # What the robot might be instead
 
 
-def test_senses_of_the_profile_are_confirmed(settle, armpi):
-    remarks = sense_remarks(fit_settling(settle(TYPICAL, seed=9, movements=60)), armpi)
-    assert remarks[0] == "sense of motor_1: cannot be told, gravity does not load it"
-    for remark, sense in zip(remarks[1:], ("+1", "-1", "+1"), strict=True):
-        assert f"{sense} as in the profile" in remark
-
-
-def test_motors_that_do_not_give_way_do_not_tell_their_sense(settle, armpi):
-    """Runs of a simulation without imperfections: nothing sags, either way."""
-    ideal = replace(TYPICAL, bias=(0.0,) * 4, compliance=(0.0,) * 4, friction=(0.0,) * 4)
-    for scatter in (1e-6, 2e-3):
-        seen = settle(replace(ideal, scatter=(scatter,) * 4), seed=9, movements=30)
-        for remark in sense_remarks(fit_settling(seen), armpi):
-            assert "check it" not in remark
-            assert "as in the profile" not in remark
-
-
-def test_a_wrong_sense_is_found_and_blames_no_other_motor(settle, armpi):
+def test_a_motor_that_turns_the_other_way_seems_to_rise_against_gravity(settle, armpi):
     motors = tuple(replace(motor, sense=1.0) for motor in armpi.motors)
     straight = replace(armpi, profile=replace(armpi.profile, motors=motors))
-    seen = settle(TYPICAL, seed=9, movements=60, robot=straight).of(
-        uncalibrated(armpi, of_motors=True)
-    )
-    remarks = sense_remarks(fit_settling(seen), armpi)
-    assert "motor_3: the logs speak for +1" in remarks[2]
-    assert "the profile says -1; check it" in remarks[2]
-    assert "+1 as in the profile" in remarks[1]
-    assert "+1 as in the profile" in remarks[3]
-
-
-def test_a_tool_that_is_seen_tells_senses_that_would_put_it_elsewhere(settle, armpi):
-    """Turned the other way a motor moves the tool by hundreds of millimetres: no settling does."""
-    watched = replace(armpi, profile=replace(armpi.profile, sensor_pose="physical"))
-    seen = settle(TYPICAL, seed=9, readings=False, robot=watched)
-    remarks = sense_remarks(fit_settling(seen), watched)
-    for remark, motor in zip(remarks, watched.motors, strict=True):
-        sense = f"{motor.sense:+.0f}"
-        assert f"{sense} as in the profile; the other way the tool would be elsewhere" in remark
+    seen = settle(TYPICAL, seed=9, movements=60, robot=straight)
+    for robot, told in ((armpi, ["motor_3"]), (straight, [])):
+        fit = fit_settling(seen.of(uncalibrated(robot, of_motors=True))).fit
+        remarks = spring_remarks(settling_parameters(fit, robot, 0.0))
+        named = [remark.split()[2].rstrip(":") for remark in remarks]
+        assert named == told
+        assert all("check its sense" in remark for remark in remarks)
 
 
 def test_no_payload_is_told_where_there_is_none(settle, armpi):

@@ -117,7 +117,7 @@ def test_a_path_that_no_commands_make_is_named(cells, armpi, tmp_path, twin):
     both[:, :3] += 1e-3 * np.random.default_rng(0).normal(size=(len(both), 3))
     scipy.io.savemat(tmp_path / "dataset_1.mat", {"dataset": both})
 
-    with pytest.raises(InputError, match=r"dataset_1.*--approximate"):
+    with pytest.raises(InputError, match=r"dataset_1.*holds its commands"):
         read_runs(tmp_path / "dataset_1.mat", armpi)
 
 

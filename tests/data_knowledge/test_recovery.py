@@ -158,7 +158,7 @@ def test_a_spoilt_path_is_refused_by_name(simulated, armpi, twin, kind):
     desired[1] += spoilt
     with pytest.raises(InputError, match="run 'run_1'") as caught:
         on_known_grid(desired, armpi, names=names_of(desired))
-    assert "--approximate" in str(caught.value)
+    assert "holds its commands" in str(caught.value)
 
 
 def test_motor_1_is_found_where_the_tool_is_on_its_axis(armpi, twin):
@@ -295,14 +295,11 @@ def test_another_kind_of_arm_comes_back_exactly_too(armpi, simulated):
     np.testing.assert_allclose(found.target[whole], simulated.target[:3][whole], atol=1e-9)
 
 
-def test_a_robot_without_servo_units_asks_for_approximate(armpi, simulated):
+def test_a_robot_without_servo_units_is_refused(armpi, simulated):
     robot = replace(armpi, profile=replace(armpi.profile, servo_units=None))
     desired = DigitalTwin(robot).path(simulated.reference(FROM_ZERO))[:1]
-    with pytest.raises(InputError, match=r"the robot has no servo units.*--approximate"):
+    with pytest.raises(InputError, match="the robot has no servo units"):
         on_known_grid(desired, robot, names=["a"])
-    grid, found = recover_movements(desired, robot, approximate=True, names=["a"])
-    np.testing.assert_array_equal(grid, published_time_bases(1000)[0])
-    assert path_error(found, desired, grid, robot).max() < 5e-3
 
 
 @pytest.fixture(scope="module")
@@ -316,35 +313,8 @@ def between_units(simulated):
     return Movements(initial, target + shift, ramp, start)
 
 
-def test_targets_between_units_are_fitted_when_asked(armpi, twin, between_units):
+def test_targets_between_units_are_refused(armpi, twin, between_units):
     desired = twin.path(between_units.reference(FROM_ZERO))
     names = names_of(desired)
-    with pytest.raises(InputError, match=r"run 'run_0'.*--approximate"):
+    with pytest.raises(InputError, match=r"run 'run_0'.*holds its commands"):
         on_known_grid(desired, armpi, names=names)
-    found = on_known_grid(desired, armpi, approximate=True, names=names)
-    assert path_error(found, desired, FROM_ZERO, armpi).max() < 1e-3
-
-
-def test_noisy_paths_are_fitted_when_asked(armpi, twin, between_units):
-    desired = twin.path(between_units.reference(FROM_ZERO))
-    noisy = desired + 1e-4 * np.random.default_rng(0).standard_normal(desired.shape)
-    found = on_known_grid(noisy, armpi, approximate=True, names=names_of(desired))
-    off = twin.path(found.reference(FROM_ZERO)) - desired
-    assert np.sqrt(np.mean(np.sum(off**2, axis=2), axis=1)).max() < 5e-4
-
-
-def test_approximate_keeps_exact_runs_exact(simulated, armpi, twin):
-    desired = twin.path(simulated.reference(FROM_ZERO))[:3]
-    names = names_of(desired)
-    exact = on_known_grid(desired, armpi, names=names)
-    also = on_known_grid(desired, armpi, approximate=True, names=names)
-    np.testing.assert_array_equal(exact.target, also.target)
-
-
-def test_a_path_of_no_movements_is_refused_even_then(armpi):
-    time = FROM_ZERO
-    circle = 0.1 * np.stack([np.cos(3 * time), np.sin(3 * time), np.sin(time) + 2.0], axis=-1)
-    with pytest.raises(
-        InputError, match=r"run 'circle': the best movements .* off its desired path"
-    ):
-        on_known_grid(circle[None], armpi, approximate=True, names=["circle"], time=time)

@@ -13,7 +13,7 @@ from failuretwin.app.commands.options import LiveOptions, RobotOptions
 from failuretwin.app.fleet import run_until_stopped
 from failuretwin.app.terminal import tell
 from failuretwin.connection.fleet.bridge import Publisher, bridge_fleet, bridge_source
-from failuretwin.connection.fleet.broker import Access, Broker, open_broker
+from failuretwin.connection.fleet.broker import Access, open_broker
 from failuretwin.connection.fleet.emulated_fleet import EmulatedFleet
 from failuretwin.connection.fleet.messages import ROBOT_NAME, ProfileMessage
 from failuretwin.core.errors import InputError, counted
@@ -21,7 +21,7 @@ from failuretwin.core.foreign import read_text
 
 
 def bridge_one(
-    access: Access, source: str, name: str, live: LiveOptions, robot: RobotOptions, as_json: bool
+    access: Access, source: str, name: str, live: LiveOptions, robot: RobotOptions
 ) -> None:
     """Put one robot on the broker until its source ends, or until stopped."""
     profile = _profile(name, robot)
@@ -30,7 +30,7 @@ def bridge_one(
         with ExitStack() as stack:
             link, _ = connect(source, robot.model, live, robot.seed, stack)
             broker = await open_broker(access, f"bridge-{name}")
-            publisher = _publisher(broker, stop, robot, as_json)
+            publisher = Publisher(broker, tell, stop, len(robot.model.motors))
             await publisher.announce([name], profile)
             tell(f"{name}: {link.name} to {access.shown}; stop with Ctrl-C")
             await bridge_source(link, name, publisher, stop)
@@ -41,7 +41,7 @@ def bridge_one(
 
 
 def bridge_emulated(
-    access: Access, name: str, robots: int, live: LiveOptions, robot: RobotOptions, as_json: bool
+    access: Access, name: str, robots: int, live: LiveOptions, robot: RobotOptions
 ) -> None:
     """Put emulated robots on the broker; each fault is that of one of them, spread evenly."""
     profile, known = _profile(name, robot), robot.known
@@ -58,7 +58,7 @@ def bridge_emulated(
 
     async def main(stop: asyncio.Event) -> None:
         broker = await open_broker(access, f"bridge-{name}")
-        publisher = _publisher(broker, stop, robot, as_json)
+        publisher = Publisher(broker, tell, stop, len(robot.model.motors))
         fleet = EmulatedFleet(arms, time.time(), live.seconds or math.inf)
         await publisher.announce(fleet.names, profile)
         tell(f"{counted(robots, 'emulated robot')} to {access.shown}; stop with Ctrl-C")
@@ -67,12 +67,6 @@ def bridge_emulated(
         tell(f"{counted(publisher.sent, 'message')} sent")
 
     run_until_stopped(main)
-
-
-def _publisher(
-    broker: Broker, stop: asyncio.Event, robot: RobotOptions, as_json: bool
-) -> Publisher:
-    return Publisher(broker, tell, stop, None if as_json else len(robot.model.motors))
 
 
 def _profile(name: str, robot: RobotOptions) -> ProfileMessage:

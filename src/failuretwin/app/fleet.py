@@ -18,7 +18,7 @@ from rich.live import Live
 from rich.table import Table
 
 from failuretwin.connection.fleet import broker as names
-from failuretwin.connection.fleet.broker import Access, Broker, open_broker
+from failuretwin.connection.fleet.broker import Access, Broker, entries, open_broker
 from failuretwin.connection.fleet.messages import ProfileMessage
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.foreign import printable
@@ -88,12 +88,12 @@ async def read_status(broker: Broker) -> dict[str, Any]:
     )
     for key, name in buckets:
         try:
-            bucket = await broker.bucket(name)
-            for one in await bucket.keys():
-                value = (await bucket.get(one)).value or b"{}"
-                found[key][one] = value.decode() if key == "leases" else json.loads(value)
-        except Error:  # nobody has reported yet
+            stored = await entries(await broker.bucket(name))
+        except (Error, TimeoutError):  # nobody has reported yet
             continue
+        for one, entry in stored.items():
+            value = entry.value or b"{}"
+            found[key][one] = value.decode() if key == "leases" else json.loads(value)
     for key, stream in (("waiting", names.EVENTS_STREAM), ("alarms", names.ALARM_STREAM)):
         try:
             found[key] = (await broker.stream.stream_info(stream)).state.messages

@@ -48,7 +48,7 @@ def work(
 
     async def main(stop: asyncio.Event) -> None:
         broker = await open_broker(access, settings.name)
-        with Retained(mqtt, settings.name, tell) as retained:
+        with Retained(mqtt, settings.name, tell, access.ca) as retained:
             outlets = Outlets(tell, figures, retained.publish if mqtt else None)
             worker = Worker(broker, settings, resolver(profiles), outlets)
             tell(f"worker {settings.name} at {access.shown}; stop with Ctrl-C")

@@ -17,7 +17,6 @@ from failuretwin.data_knowledge.readers.column_guess import column_map_text
 from failuretwin.data_knowledge.readers.column_map import CORRECTION, read_column_map
 from failuretwin.data_knowledge.readers.lerobot import is_lerobot, lerobot_map_text
 from failuretwin.data_knowledge.readers.lerobot_units import GUESSED, LeRobotAngles
-from failuretwin.data_knowledge.readers.matlab import RECOVERY_ERROR, RECOVERY_WORST
 from failuretwin.data_knowledge.readers.read import ReadOptions, find_logs, read_logs
 from failuretwin.data_knowledge.run_pieces import RunPieces
 from failuretwin.data_knowledge.store import write_text
@@ -38,9 +37,6 @@ if TYPE_CHECKING:
 
     from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
 
-REPORTED_ERROR_M = 1e-6
-"""Error of recovered commands from which it is reported [m]; exact ones are below 1e-9."""
-
 
 def read_inputs(
     logs: Sequence[Path],
@@ -59,13 +55,6 @@ def read_inputs(
     source = str(runs.attrs.get("source", ""))
     if source.startswith("LeRobot") and GUESSED in source:
         tell(f"note: {source.rpartition('; ')[0]}. State it with --columns MAP.toml", err=True)
-    error = float(runs.attrs.get(RECOVERY_ERROR, 0.0))
-    if error > REPORTED_ERROR_M:
-        tell(
-            f"note: approximate commands miss the desired path by up to {1000 * error:.1f} mm "
-            f"(worst: {runs.attrs[RECOVERY_WORST]}); a diagnosis can be no better than that",
-            err=True,
-        )
     return runs
 
 

@@ -3,7 +3,7 @@
 A desired path is what the kinematics make of the reference of the motors. Every ramp is fitted by
 least squares from many first guesses: targets by inverse kinematics, durations at random. A path
 without noise then gives the poses and speeds, and every ramp is rounded to whole servo counts and
-published durations, exactly. Other paths can be fitted by least squares.
+published durations, exactly.
 """
 
 from __future__ import annotations
@@ -53,23 +53,10 @@ DURATION_SHARES = (0.6, 1.0)
 """Range of guessed durations, as shares of the time in which the tool moves."""
 FIT_SAMPLES, REST_SAMPLES = 24, 5
 """Samples for the fit of a ramp, and samples at rest on both sides of it."""
-RAMP_STEPS, START_STEPS, RUN_STEPS = 60, 8, 100
-"""Maximum number of steps of the fits of a ramp, its start and a run."""
-SEEDS = (0, 1, 2)
-"""Seeds of the guesses for a run, each tried until the fit is as good as the path's noise."""
-EQUAL_SHARE = 0.1
-"""Fits that are worse by less than this share of the best are as good."""
-POOR_FIT_M = 0.01
-"""Largest rms error of a path made of movements [m]."""
-
-SMOOTH_SAMPLES = 10
-"""Samples of the moving average that shows movements in a noisy path."""
-NO_NOISE_M = 1e-7
-"""Less noise [m] does not count."""
-NOISE_FACTOR = 2.5
-"""Change of the average, in standard deviations of the noise, that counts as motion."""
-GOOD_FIT = 2.0
-"""Largest rms of a fit that is as good as the noise, in standard deviations of the noise."""
+RAMP_STEPS, START_STEPS = 60, 8
+"""Maximum number of steps of the fits of a ramp and its start."""
+MOVES_M = 1e-7
+"""Change between two samples [m] that counts as motion."""
 LEAST_REST_S, LEAST_MOVEMENT_S = 0.3, 0.1
 """Shorter rests belong to a movement, shorter movements to a rest [s]."""
 
@@ -80,7 +67,6 @@ def recover_movements(
     *,
     names: Sequence[str],
     time: FloatArray | None = None,
-    approximate: bool = False,
 ) -> tuple[FloatArray, Movements]:
     """Return the time grid (time,) [s] and the movements whose reference makes the desired paths.
 
@@ -94,19 +80,14 @@ def recover_movements(
         robot: The robot.
         names: Name of each run, for messages.
         time: Uniform time grid, (time,) [s]; None: the published one that fits.
-        approximate: Fit the runs that have no such movements by least squares, with targets
-            and durations of any value. A tool position leaves the pose of an arm with more than
-            three motors open; the fit takes the pose nearest to the one before it among those
-            that also fit the ramps.
 
     Raises:
-        InputError: If a run has no such movements and `approximate` is False, or nothing of its
-            path can be fitted.
+        InputError: If a run has no such movements.
     """
     grids = published_time_bases(desired.shape[1]) if time is None else [time]
     grid = _fitting_grid(grids, desired, robot)
     parts = [
-        _recover_run(Samples(grid, path), robot, approximate, name)
+        _recover_run(Samples(grid, path), robot, name)
         for path, name in zip(desired, names, strict=True)
     ]
     return grid, stack_movements(parts)
@@ -141,16 +122,14 @@ def _fitting_grid(grids: Sequence[FloatArray], desired: FloatArray, robot: Robot
     return grids[0]
 
 
-def _recover_run(path: Samples, robot: Robot, approximate: bool, name: str) -> Movements:
+def _recover_run(path: Samples, robot: Robot, name: str) -> Movements:
     try:
         return _whole_run(path, robot)
     except _NoWholeUnitsError as reason:
-        if approximate:
-            return _nearest_run(path, robot, name)
         raise InputError(
             f"run {name!r}: no movements of robot {robot.name!r} between whole servo units make "
             f"its desired path exactly: {reason}. If the path is of another robot, give that one "
-            "with --robot; if its targets are no whole units or it holds noise, use --approximate."
+            "with --robot. Else give a log that holds its commands."
         ) from None
 
 
@@ -165,46 +144,13 @@ def _whole_run(path: Samples, robot: Robot) -> Movements:
     """
     if robot.profile.servo_units is None:
         raise _NoWholeUnitsError("the robot has no servo units")
-    run = _Run(path, DigitalTwin(robot), noise=0.0)
+    run = _Run(path, DigitalTwin(robot))
     movements = run.whole()
     error = path_error(movements, path, run.twin)[0]
     if error.max() > EXACT_M:
         at = path.time[error.argmax()]
         raise _NoWholeUnitsError(f"at {at:.2f} s the tool does not rest where it should")
     return movements
-
-
-def _nearest_run(path: Samples, robot: Robot, name: str) -> Movements:
-    """Return the movements that fit a path best."""
-    least, best = np.inf, None
-    for seed in SEEDS:
-        run = _Run(path, DigitalTwin(robot), _noise(path), np.random.default_rng(seed))
-        movements = run.nearest()
-        rms = float(_rms(path_error(movements, path, run.twin))[0])
-        if rms < least:
-            least, best = rms, movements
-        if least <= run.good:
-            break
-    if best is None or least > POOR_FIT_M:
-        raise InputError(
-            f"run {name!r}: the best movements of robot {robot.name!r} are {least:.3f} m (rms) off "
-            "its desired path. Expected ramps that all motors start together, with rests of "
-            f"{LEAST_REST_S} s or more between them; give the robot it is of with --robot."
-        )
-    return best
-
-
-def _noise(path: Samples) -> float:
-    """Return the standard deviation of a path's noise on each axis [m].
-
-    The lower quartile of second differences, 0.32 sqrt(6) deviations, counts the samples at rest.
-    """
-    bends = np.abs(np.diff(path.value, 2, axis=0))
-    return float(np.quantile(bends, 0.25) / (0.32 * np.sqrt(6.0))) if bends.size else 0.0
-
-
-def _rms(error: FloatArray) -> FloatArray:
-    return np.sqrt(np.mean(error**2, axis=-1))
 
 
 @dataclass(frozen=True)
@@ -214,38 +160,25 @@ class _Run:
     Attributes:
         path: The desired path.
         twin: Kinematics.
-        noise: Standard deviation of the path's noise on each axis [m].
         rng: Draws first guesses.
     """
 
     path: Samples
     twin: DigitalTwin
-    noise: float
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
     @cached_property
     def kinematics(self) -> InverseKinematics:
         return InverseKinematics.of(self.twin.robot)
 
-    @property
-    def good(self) -> float:
-        """Largest rms error of a fit that is as good as the path [m]."""
-        return GOOD_FIT * np.sqrt(3.0) * self.noise + NO_NOISE_M
-
     @cached_property
     def spans(self) -> list[Span]:
-        """Samples around every movement that stands out of the noise."""
-        time, point, end = self.path.time, self.path.value, len(self.path.time) - 1
-        width = SMOOTH_SAMPLES if self.noise > NO_NOISE_M and end >= 3 * SMOOTH_SAMPLES else 1
-        average = [np.convolve(axis, np.full(width, 1.0 / width), "valid") for axis in point.T]
-        smooth = np.stack(average, axis=1)
-        change = np.linalg.norm(smooth[width:] - smooth[:-width], axis=1)
-        moving = change > max(NOISE_FACTOR * self.noise, NO_NOISE_M)
+        """Samples around every movement."""
+        time, end = self.path.time, len(self.path.time) - 1
+        moving = np.linalg.norm(np.diff(self.path.value, axis=0), axis=1) > MOVES_M
         edges = np.flatnonzero(np.diff(np.concatenate([[0], moving.astype(int), [0]])))
         spans: list[Span] = []
-        for first, last in edges.reshape(-1, 2).tolist():
-            # A change between two averages shows up to two widths before it begins.
-            begin, stop = min(first + width - 1, last), min(last + width - 1, end)
+        for begin, stop in edges.reshape(-1, 2).tolist():
             if spans and time[begin] - time[spans[-1][1]] < LEAST_REST_S:
                 begin = spans.pop()[0]
             spans.append((begin, stop))
@@ -363,35 +296,6 @@ class _Run:
         ends = np.stack([self.kinematics.low, self.kinematics.high])
         low, high = np.sort(self.twin.robot.servo_units.to_counts(ends), axis=0)
         return np.stack([np.ceil(low - 1e-9), np.floor(high + 1e-9)])
-
-    # Movements of any kind.
-
-    def nearest(self) -> Movements:
-        if not self.spans:
-            poses = self._poses(self.rests[0], GUESSES[0])
-            return self._joined(poses[_nearest_first(poses, self._zero)][:1], [])
-        return self._together(self._chain(self._nearest_ramps))
-
-    def _nearest_ramps(self, m: int, origins: FloatArray | None) -> Movements:
-        """Return the ramps that fit movement `m` as well as the best, least travel first."""
-        for count in GUESSES[1:]:
-            fitted = self._fitted(m, origins, None, count)
-            rms = _rms(path_error(fitted, self._part(m), self.twin))
-            if rms.min() <= self.good:
-                break
-        fitted = fitted[rms <= rms.min() * (1.0 + EQUAL_SHARE) + NO_NOISE_M]
-        origin, target = fitted.initial, fitted.target[:, 0]
-        travel = np.linalg.norm(target - origin, axis=1) + np.linalg.norm(origin, axis=1)
-        return fitted[np.argsort(travel, kind="stable")]
-
-    def _together(self, guess: Movements) -> Movements:
-        """Return all movements of the run fitted at once."""
-        count, motors = guess.target.shape[1:]
-        free = np.full((1 + 2 * count) * motors, True)
-        fitted = fit(guess, self.path, self.twin, free, RUN_STEPS)
-        return _without_idle_ramps(fitted)
-
-    # Both.
 
     def _chain(self, ramps_of: Callable[[int, FloatArray | None], Movements]) -> Movements:
         """Return movements whose origins are the targets before them.

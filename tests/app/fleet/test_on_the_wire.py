@@ -17,15 +17,15 @@ from failuretwin.app.cli import cli
 from failuretwin.connection.fleet.broker import IN, Access, open_broker
 from failuretwin.connection.fleet.messages import (
     events_binary,
-    events_json,
     profile_json,
 )
 from failuretwin.connection.fleet.mqtt import Retained
 from failuretwin.connection.links.base import Reading
 from failuretwin.core.errors import InputError
-from fleet_messages import PROFILE_OF
+from failuretwin.decision.fleet import partition as partition_module
+from fleet_messages import PROFILE_OF, events_json
 from fleet_servers import Mosquitto, NatsServer
-from running_fleet import alarms, ask, health, start, until, worker_thread
+from running_fleet import alarms, ask, health, start, uncovered, until, worker_thread
 
 READING = events_json([Reading(1.0, np.array([0.1, 0.0, 0.3]))])
 
@@ -157,6 +157,24 @@ def test_a_message_that_breaks_the_filter_refuses_its_robot_alone(server, monkey
         )
         assert "good" in robots(reports)
     assert any("ZeroDivisionError" in line for line in told)
+
+
+def test_an_upgrade_that_cannot_read_a_snapshot_begins_anew(server, monkeypatch):
+    async def send(broker):
+        await broker.stream.publish(f"{IN}.arm.profile", profile_json(PROFILE_OF))
+        await broker.stream.publish(f"{IN}.arm.events", READING)
+
+    with worker_thread(server.url, "old"):
+        ask(server.url, send)
+        until(server.url, health, lambda found: "arm" in robots(found))
+    monkeypatch.setattr(partition_module, "FORMAT", partition_module.FORMAT + 1)
+    with worker_thread(server.url, "new") as (told, _):
+        assert any("Its robots begin anew" in line for line in told), told
+        ask(server.url, send)
+        until(server.url, uncovered, lambda count: count == 0)
+    reports = ask(server.url, health)
+    assert {one["worker"] for one in reports.values()} == {"new"}
+    assert "arm" in robots(reports)
 
 
 # Users, TLS and permissions.

@@ -71,7 +71,6 @@ partitions_option = click.option(
     metavar="N",
     help="With `emulated`: how many; each --fault is that of one of them.",
 )
-@opt.flag_option("--as-json", "Send JSON instead of the compact form.")
 @access_options
 @opt.live_options
 @opt.plugin_option
@@ -81,7 +80,6 @@ def bridge(
     url: str,
     name: str | None,
     robots: int,
-    as_json: bool,
     access: AccessOptions,
     live: opt.LiveOptions,
     robot: opt.RobotOptions,
@@ -96,11 +94,11 @@ def bridge(
 
     to = access.to(url)
     if source == opt.EMULATED:
-        bridge_emulated(to, name or "arm", robots, live, robot, as_json)
+        bridge_emulated(to, name or "arm", robots, live, robot)
         return
     if robots != 1:
         opt.refuse_unused("only emulated robots are many", "robots")
-    bridge_one(to, source, name or robot.model.name, live, robot, as_json)
+    bridge_one(to, source, name or robot.model.name, live, robot)
 
 
 @click.command()

@@ -240,13 +240,12 @@ class LogOptions:
     how: str
     published_labels: bool
     columns: Path | None
-    approximate: bool
 
     @property
     def options(self) -> ft.ReadOptions:
         """How logs become runs, but for the map of columns."""
         how = cast("As", self.how)
-        return ft.ReadOptions(how, self.published_labels, approximate=self.approximate)
+        return ft.ReadOptions(how, self.published_labels)
 
     def runs(self, robot: ft.Robot, workforce: Workforce | None = None) -> xr.Dataset:
         """Return the runs of all logs as one run set; None: this process reads them."""
@@ -278,11 +277,6 @@ reading_options = gathered(
         "Meaning of the columns of a CSV file (or the topics of a bag, or the angles of a LeRobot "
         "data set). If MAP.toml does not exist, a guess is written there for you to check. For a "
         "LeRobot data set it may be the calibration file of the arm (.json).",
-    ),
-    flag_option(
-        "--approximate",
-        "Published paths without commands: accept commands that reproduce the desired path "
-        "only in the least-squares sense.",
     ),
 )
 

@@ -9,17 +9,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.app.reports.plots import BLUE, GREY, RED, clean, new_figure, png, render_page
+from failuretwin.app.reports.plots import BLUE, GREY, clean, new_figure, png, render_page
 from failuretwin.app.reports.technician_page import Section
 from failuretwin.app.terminal import Part, Table, figures_table
 from failuretwin.connection.calibration.cross_validation import (
-    ExampleTransient,
     Predictions,
-    example_transient,
     predict,
     settling_of,
 )
@@ -31,21 +29,16 @@ from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.store import filling
 from failuretwin.digital_model.robot import Robot, shown_unit
-from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.explanation import joint_names_in
 from failuretwin.inference.together.wear_limits import wear_unit
 
 if TYPE_CHECKING:
     import xarray as xr
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Pictures: expected errors, residuals, and a ramp.
+# The picture: settled errors against expected ones.
 
 MOST_COLUMNS, PANEL_IN, WIDTH_IN = 4, 3.2, 11.6
-DIRECTIONS = ((1.0, BLUE, "towards larger angles"), (-1.0, RED, "towards smaller angles"))
-LOAD_FLOOR_NM = 1e-3
-"""Load torque below which a motor counts as unloaded in the pictures [N m]."""
 
 
 def channels(robot: Robot, of_motors: bool) -> tuple[list[str], float, str]:
@@ -56,56 +49,14 @@ def channels(robot: Robot, of_motors: bool) -> tuple[list[str], float, str]:
     return [name.replace("_", " ") for name in robot.motor_names], scale, unit
 
 
-def _panels(names: list[str]) -> tuple[Figure, list[Axes]]:
-    """Return a figure with a panel for each channel, to be handed to `_finish`."""
-    columns = min(len(names), MOST_COLUMNS)
-    rows = -(-len(names) // columns)
-    figure = new_figure(WIDTH_IN, PANEL_IN * rows + 0.4)
-    panels = [figure.add_subplot(rows, columns, i + 1, title=n) for i, n in enumerate(names)]
-    return figure, panels
-
-
-def _finish(figure: Figure, panels: Sequence[Axes], below: str = "", beside: str = "") -> Figure:
-    """Return a figure with its axes labelled and one legend for all panels."""
-    for panel in panels:
-        if below:
-            panel.set_xlabel(below, fontsize=9)
-        panel.title.set_fontsize(10)
-        panel.tick_params(labelsize=8)
-        clean(panel)
-    panels[0].set_ylabel(beside)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=9
-    )
-    return figure
-
-
-def load_figure(seen: Predictions, settling: Settling, robot: Robot) -> Figure:
-    """Return the settled error of each motor against its load, with the fitted lines."""
-    names, scale, unit = channels(robot, True)
-    figure, panels = _panels(names)
-    for k, panel in enumerate(panels):
-        torque = seen.torque[:, k]
-        loaded = bool(np.abs(torque).max(initial=0.0) > LOAD_FLOOR_NM)
-        x = torque if loaded else np.rad2deg(seen.target[:, k])
-        for sign, colour, label in DIRECTIONS:
-            chosen = seen.counts[:, k] & (seen.direction[:, k] == sign)
-            panel.plot(x[chosen], scale * seen.error[chosen, k], ".", ms=5, color=colour, alpha=0.6)
-            ends = np.array([x.min(), x.max()]) if len(x) else np.zeros(2)
-            slope = settling.compliance[k] if loaded else 0.0
-            line = settling.bias[k] - settling.friction[k] * sign + slope * ends
-            panel.plot(ends, scale * line, color=colour, lw=1.8, label=label)
-        panel.axhline(0.0, color=GREY, lw=0.8, zorder=0)
-        panel.set_xlabel("load torque [N m]" if loaded else "target [deg], no load", fontsize=9)
-    return _finish(figure, panels, beside=f"settled error [{unit}]")
-
-
 def expected_figure(seen: Predictions, robot: Robot) -> Figure:
     """Return settled errors against expected ones, each channel a panel."""
     names, scale, unit = channels(robot, seen.of_motors)
-    figure, panels = _panels(names)
-    for k, (panel, name) in enumerate(zip(panels, names, strict=True)):
+    columns = min(len(names), MOST_COLUMNS)
+    rows = -(-len(names) // columns)
+    figure = new_figure(WIDTH_IN, PANEL_IN * rows + 0.4)
+    for k, name in enumerate(names):
+        panel = figure.add_subplot(rows, columns, k + 1)
         kept = seen.counts[:, k]
         expected, error = (scale * e[kept, k] for e in (seen.expected, seen.error))
         reach = _reach(expected, error)
@@ -118,50 +69,22 @@ def expected_figure(seen: Predictions, robot: Robot) -> Figure:
         if beyond:
             panel.annotate(f"{beyond} beyond", (0.03, 0.94), xycoords="axes fraction", fontsize=8)
         before, after = (1.4826 * float(np.median(np.abs(e))) for e in (error, error - expected))
-        panel.set_title(f"{name}: {before:.2f} to {after:.2f} {unit}")
-    return _finish(figure, panels, f"expected error [{unit}]", f"settled error [{unit}]")
+        panel.set_title(f"{name}: {before:.2f} to {after:.2f} {unit}", fontsize=10)
+        panel.set_xlabel(f"expected error [{unit}]", fontsize=9)
+        panel.tick_params(labelsize=8)
+        clean(panel)
+    figure.axes[0].set_ylabel(f"settled error [{unit}]")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=9
+    )
+    return figure
 
 
 def _reach(expected: FloatArray, error: FloatArray) -> float:
     """Return the limit of a square panel that a few outliers do not squeeze."""
     usual = float(np.quantile(np.abs(error), 0.975)) if len(error) else 0.0
     return 1.08 * max(1.5 * usual, float(np.abs(expected).max(initial=1e-9)))
-
-
-def quantile_figure(seen: Predictions, dof: float, robot: Robot) -> Figure:
-    """Return quantiles of the residuals against those of the fitted Student t distribution."""
-    from scipy.stats import beta, t
-
-    figure, panels = _panels(channels(robot, seen.of_motors)[0])
-    for k, panel in enumerate(panels):
-        kept = seen.counts[:, k]
-        left = np.sort((seen.error - seen.expected)[kept, k] / seen.scale[kept, k])
-        order = np.arange(1, len(left) + 1)
-        theory = t.ppf((order - 0.5) / len(left), dof)
-        low, high = (t.ppf(beta.ppf(p, order, order[::-1]), dof) for p in (0.025, 0.975))
-        panel.fill_between(theory, low, high, color=GREY, alpha=0.35, lw=0, label="95 % band")
-        panel.plot(theory, theory, color=BLUE, lw=1.2, label="as the calibration says")
-        panel.plot(theory, left, ".", ms=4, color="black", alpha=0.7, label="settled movement")
-        reach = 1.08 * float(np.abs(np.concatenate([left, theory, [1.0]])).max())
-        panel.set_ylim(-reach, reach)
-    return _finish(figure, panels, "expected quantile [scales]", "what is left [scales]")
-
-
-def ramp_figure(ramp: ExampleTransient, robot: Robot) -> Figure:
-    """Return one movement: command, twin before and after calibration, and readings."""
-    names, scale, unit = channels(robot, ramp.of_motors)
-    figure, panels = _panels(names)
-    for k, panel in enumerate(panels):
-        command, plain, calibrated, reading = (
-            scale * values[:, k]
-            for values in (ramp.command, ramp.plain, ramp.calibrated, ramp.reading)
-        )
-        panel.plot(ramp.time, command, color=GREY, lw=2.2, label="command")
-        panel.plot(ramp.time, plain, "--", color=RED, lw=1.2, label="uncalibrated")
-        panel.plot(ramp.time, calibrated, color=BLUE, lw=1.4, label="calibrated")
-        panel.plot(ramp.time, reading, ".", color="black", ms=6, label="readings")
-    what = "angle" if ramp.of_motors else "position"
-    return _finish(figure, panels, "time since the command [s]", f"{what} [{unit}]")
 
 
 # Sentences and tables.
@@ -281,7 +204,7 @@ def write_calibration_page(
     found: Calibration, runs: xr.Dataset, robot: Robot, folder: Path
 ) -> None:
     """Write `index.html` into a folder; the runs are those learned from or judged on."""
-    units = robot.profile.servo_units
+    units, seen = robot.profile.servo_units, predict(found, runs, robot)
     text = render_page(
         "calibration.html.j2",
         {
@@ -293,27 +216,12 @@ def write_calibration_page(
             "parameters": parameter_table(found.parameters, robot),
             "count_deg": None if units is None else units.deg_per_count,
             "left_out_line": left_out_line(found),
-            **_pictures(found, runs, robot),
+            "expected": png(expected_figure(seen, robot)) if seen.counts.any() else "",
+            "unseen": seen.unseen,
         },
     )
     with filling(folder) as partial:
         (partial / "index.html").write_text(text, encoding="utf-8")
-
-
-def _pictures(found: Calibration, runs: xr.Dataset, robot: Robot) -> dict[str, Any]:
-    """Return the pictures that have data, by name, and the values of their captions."""
-    seen, settling = predict(found, runs, robot), settling_of(found, robot)
-    ramp = example_transient(found, runs, robot)
-    figures = {}
-    if seen.counts.any():
-        figures["expected"] = expected_figure(seen, robot)
-        figures["quantiles"] = quantile_figure(seen, settling.tail_dof, robot)
-        if seen.of_motors:
-            figures["load"] = load_figure(seen, settling, robot)
-    if ramp is not None:
-        figures["ramp"] = ramp_figure(ramp, robot)
-    pictures = {name: png(figure) for name, figure in figures.items()}
-    return {"pictures": pictures, "unseen": seen.unseen, "dof": settling.tail_dof, "ramp": ramp}
 
 
 # Robot behaviour learned from runs by `diagnose --self-calibrate` and `--track`.

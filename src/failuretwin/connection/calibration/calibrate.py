@@ -41,7 +41,6 @@ from failuretwin.connection.calibration.settling_fit import (
     SettlingFit,
     best_payload,
     fit_settling,
-    sense_remarks,
 )
 from failuretwin.connection.calibration.timing_fit import (
     fit_timing,
@@ -112,8 +111,7 @@ def fit_calibration(
             out. None: all count.
         judged: Healthy runs of sessions that only say how good the fit is; None: each session is
             left out once and judged by a fit to the others.
-        thorough: Whether to check the fit on sessions that it has not seen, and the senses and
-            payload of the robot.
+        thorough: Whether to check the fit on sessions that it has not seen, and the payload.
 
     Raises:
         InputError: If too few movements come to rest near their targets.
@@ -127,7 +125,7 @@ def fit_calibration(
     payload, remarks = 0.0, list[str]()
     if thorough:
         payload, told = best_payload(part, robot)
-        remarks = [*sense_remarks(part, robot), told]
+        remarks = [told]
         if payload > 0.0:
             model = uncalibrated(robot, part.observations.of_motors, payload=payload)
             part = fit_settling(part.observations.of(model))

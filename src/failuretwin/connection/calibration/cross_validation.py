@@ -9,7 +9,6 @@ import numpy as np
 from failuretwin.connection.calibration.observations import (
     Observations,
     observe,
-    rounding,
     uncalibrated,
 )
 from failuretwin.connection.calibration.result import Calibration, HeldOut
@@ -18,17 +17,10 @@ from failuretwin.connection.calibration.settling_fit import (
     SortedMovements,
     fit_settling,
 )
-from failuretwin.connection.calibration.timing_fit import (
-    AFTER_RAMP_S,
-    Transients,
-    lateness,
-    movements_of,
-    transients,
-)
 from failuretwin.core.errors import InputError
 from failuretwin.core.numerics import log_student
 from failuretwin.core.runs import RunSet
-from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
@@ -144,22 +136,14 @@ class Predictions:
     Attributes:
         error: Settled minus commanded, (movement, channel).
         expected: What the fit expects it to be, (movement, channel).
-        scale: Scale of the Student t distribution of the difference, (movement, channel).
         counts: Entries whose command arrived and that look healthy, (movement, channel).
-        target: Commanded angles, (movement, motor) [rad].
-        direction: Sign of the commanded travel, (movement, motor).
-        torque: Load torque that each motor meets, in the log's sense, (movement, motor) [N m].
         of_motors: Whether channels are motors.
         unseen: Whether each movement is expected by a fit that has not seen its session.
     """
 
     error: FloatArray
     expected: FloatArray
-    scale: FloatArray
     counts: BoolArray
-    target: FloatArray
-    direction: FloatArray
-    torque: FloatArray
     of_motors: bool
     unseen: bool
 
@@ -202,12 +186,6 @@ def _observed(found: Calibration, runs: RunSet, robot: Robot) -> Observations:
     return seen.of(uncalibrated(robot, seen.of_motors, payload=payload))
 
 
-def _sorted(seen: Observations, found: Calibration) -> SortedMovements:
-    """Return what became of movements by a calibration."""
-    known = replace(found.imperfections, sensors=seen.model.imperfections.sensors)
-    return SortedMovements.of(seen, replace(seen.model, imperfections=known))
-
-
 def _expected_by_others(seen: Observations, robot: Robot) -> FloatArray | None:
     """Return the angles expected by fits to other sessions; None where too little is left."""
     groups, run = min(len(seen.sessions), MOST_FOLDS), seen.at[0]
@@ -226,116 +204,19 @@ def _expected_by_others(seen: Observations, robot: Robot) -> FloatArray | None:
 def _predictions(
     seen: Observations, found: Calibration, robot: Robot, pose: FloatArray, unseen: bool
 ) -> Predictions:
-    settling, became = settling_of(found, robot), _sorted(seen, found)
-    lost, odd = became.lost, became.odd
-    twin, scatter = DigitalTwin(robot), np.asarray(settling.scatter)
+    known = replace(found.imperfections, sensors=seen.model.imperfections.sensors)
+    became = SortedMovements.of(seen, replace(seen.model, imperfections=known))
+    lost, odd, twin = became.lost, became.odd, DigitalTwin(robot)
     error = settled_errors(seen, robot, None)
     if seen.position is not None:
         expected, counts = pose - seen.target, ~lost & ~odd[:, None]
-        scale = np.broadcast_to(np.hypot(scatter, rounding(robot)), error.shape)
     else:
-        point, jacobian = twin.path_and_jacobian(pose)
-        expected = point - twin.path(seen.target)
+        expected = twin.path(pose) - twin.path(seen.target)
         counts = np.repeat(~lost.any(axis=1, keepdims=True) & ~odd[:, None], 3, axis=1)
-        scale = np.sqrt(jacobian**2 @ scatter**2 + PATH_NOISE_M**2)
-    settled = pose if seen.position is None else seen.position
     return Predictions(
         error=error,
         expected=expected,
-        scale=scale,
         counts=counts,
-        target=seen.target,
-        direction=seen.direction,
-        torque=robot.sense * robot.loads.torque(settled * robot.sense, settling.payload),
         of_motors=seen.position is not None,
         unseen=unseen,
     )
-
-
-# One movement of the logs as an example: command, twin before and after calibration, readings.
-
-BEFORE_S, AFTER_S = 0.2, 0.5
-"""What is shown before a movement and after its ramp [s]."""
-
-
-@dataclass(frozen=True)
-class ExampleTransient:
-    """One movement; a channel is a motor [rad] or an axis of the tool [m].
-
-    Attributes:
-        run: Name of the run.
-        movement: Its number in the run, from 1.
-        time: Time since the command, (time,) [s].
-        command: What is asked for, (time, channel).
-        plain: What the uncalibrated twin does, (time, channel).
-        calibrated: What the calibrated twin does, (time, channel).
-        reading: What was read, (time, channel); NaN where nothing was.
-        of_motors: Whether channels are motors.
-    """
-
-    run: str
-    movement: int
-    time: FloatArray
-    command: FloatArray
-    plain: FloatArray
-    calibrated: FloatArray
-    reading: FloatArray
-    of_motors: bool
-
-
-def example_transient(found: Calibration, runs: RunSet, robot: Robot) -> ExampleTransient | None:
-    """Return the movement that the calibrated twin fits neither well nor badly, but typically.
-
-    It is taken from the longer half of the movements that began on time at a known place; None if
-    there are none.
-    """
-    runs = trusted_runs(found, runs)
-    settling = settling_of(found, robot)
-    seen, movements = _observed(found, runs, robot), movements_of(runs)
-    became = _sorted(seen, found)
-    ramps = transients(runs, movements, lateness(movements), seen, became, settling, robot)
-    twin = DigitalTwin(robot)
-    timing = found.imperfections.timing
-    usual = np.array([np.mean(timing.delay_s), np.mean(timing.ramp_shortening)])
-    values = np.tile(usual, (len(ramps.movements.start), 1))
-    told = ramps.predicted(robot, values, float(np.mean(timing.lag_s)))
-    chosen = _typical(ramps, told)
-    if chosen is None:
-        return None
-    run, movement = chosen
-    begin = float(ramps.movements.start[run, movement])
-    end = begin + float(np.nanmax(ramps.movements.ramp_duration[run, movement]))
-    shown = (ramps.time >= begin - BEFORE_S) & (ramps.time <= end + AFTER_S)
-    command = as_floats(runs["command"].values[run])
-    plain = twin.respond(command, ramps.time)
-    if not ramps.of_motors:
-        command, plain = twin.path(command), twin.path(plain)
-    return ExampleTransient(
-        run=str(runs["run"].values[run]),
-        movement=movement + 1,
-        time=ramps.time[shown] - begin,
-        command=command[shown],
-        plain=plain[shown],
-        calibrated=told[run][shown],
-        reading=ramps.reading[run][shown],
-        of_motors=ramps.of_motors,
-    )
-
-
-def _typical(ramps: Transients, told: FloatArray) -> tuple[int, int] | None:
-    movements = ramps.movements
-    travel = np.abs(movements.target - movements.origin()).min(axis=-1)
-    found = []
-    for run, movement in np.argwhere(movements.exists):
-        begin = movements.start[run, movement]
-        end = begin + np.nanmax(movements.ramp_duration[run, movement]) + AFTER_RAMP_S
-        inside = ramps.used[run] & (ramps.time >= begin) & (ramps.time < end)
-        if inside.any():
-            off = (told[run] - ramps.reading[run])[inside]
-            misfit = float(np.sqrt(np.mean(off**2)))
-            found.append((float(travel[run, movement]), misfit, int(run), int(movement)))
-    if not found:
-        return None
-    longer = sorted(found)[len(found) // 2 :]
-    _, _, run, movement = sorted(longer, key=lambda entry: entry[1])[len(longer) // 2]
-    return run, movement

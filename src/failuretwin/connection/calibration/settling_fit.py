@@ -9,7 +9,6 @@ Section: docs/inference.md#calibration-and-geometry
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,7 +21,6 @@ from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, largest_load
-from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.engine.theta import AS_TOLD, Layout, robot_components
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -257,92 +255,14 @@ def _refuse_few(kept: int, movements: int) -> None:
         )
 
 
-# What the robot might be beside what its profile says: another sense of a motor, a payload.
+# A payload.
 
 SURE_NATS = 5.0
-"""Log odds from which one description of the robot is told to be better than another."""
-ELSEWHERE = 3.0
-"""A sense that puts a seen tool so many times farther off than the profile's is not it [-]."""
+"""Log odds from which a payload is told to be better than none."""
 LEAST_SAG_RAD = 1e-3
 """Sag below which nothing is said of a payload [rad]: a quarter of a servo count."""
 PAYLOADS_KG = (0.02, 0.1, 0.5, 2.0)
 """Masses at the tool point that are tried [kg]."""
-
-
-def sense_remarks(part: SettlingFit, robot: Robot) -> list[str]:
-    """Return what the logs say of each motor's sense, in sentences.
-
-    A motor that turns the other way sags the other way; where gravity hardly loads it, nothing can
-    be said. Where the tool alone was seen, its position tells senses that would put it elsewhere.
-    """
-    loaded = np.flatnonzero(largest_load(robot, 0.0) > 1e-6)
-    elsewhere = _far_if_turned(part, robot)
-    best, fit, odds = _best_senses(part, robot, loaded[~elsewhere[loaded]].tolist())
-    payload = part.settling.payload
-    sag = np.abs(np.asarray(fit.settling.compliance) * largest_load(best, payload))
-    remarks = []
-    for k, motor in enumerate(robot.motors):
-        sense = best.motors[k].sense
-        if elsewhere[k]:
-            told = f"{sense:+.0f} as in the profile; the other way the tool would be elsewhere"
-        elif k in odds and sag[k] < LEAST_SAG_RAD:
-            told = "cannot be told, the motor does not give way"
-        elif k not in odds:
-            told = "cannot be told, gravity does not load it"
-        elif odds[k] <= SURE_NATS:
-            told = f"the logs do not tell ({odds[k]:+.1f} nats for {sense:+.0f})"
-        elif sense == motor.sense:
-            told = f"{sense:+.0f} as in the profile, {odds[k]:.0f} nats better than the other way"
-        else:
-            told = (
-                f"the logs speak for {sense:+.0f} by {odds[k]:.0f} nats, the profile says "
-                f"{motor.sense:+.0f}; check it"
-            )
-        remarks.append(f"sense of {motor.name}: {told}")
-    return remarks
-
-
-def _far_if_turned(part: SettlingFit, robot: Robot) -> BoolArray:
-    """Return which motors, turned the other way, put the tool where it was not seen, (motor,).
-
-    Where motors were read, or the tool's path was computed from the log, none: all turns together.
-    """
-    seen, motors = part.observations, range(len(robot.motors))
-    if seen.of_motors:
-        return np.zeros(len(motors), dtype=bool)
-    target, point = seen.target[part.fitted], seen.point[part.fitted]
-
-    def away(other: Robot) -> FloatArray:
-        return np.linalg.norm(DigitalTwin(other).path(target) - point, axis=-1)
-
-    turned = np.stack([away(_with_turned(robot, k)) for k in motors])
-    return np.asarray(np.median(turned, axis=-1) > ELSEWHERE * np.median(away(robot)))
-
-
-def _best_senses(
-    part: SettlingFit, robot: Robot, loaded: Sequence[int]
-) -> tuple[Robot, SettlingFit, dict[int, float]]:
-    """Return the robot with the senses that fit best, its fit, and how much worse others are.
-
-    The sense that gains most is turned first: a wrong one bends the loads of the motors before it,
-    and makes theirs look wrong too.
-    """
-    best, fit = robot, part
-    while True:
-        turned = {k: _refit(part, _with_turned(best, k), part.settling.payload) for k in loaded}
-        ahead = {k: fit.log_posterior - other.log_posterior for k, other in turned.items()}
-        k = min(ahead, key=lambda motor: ahead[motor], default=None)
-        if k is None or -ahead[k] <= SURE_NATS:
-            return best, fit, ahead
-        best, fit = _with_turned(best, k), turned[k]
-
-
-def _with_turned(robot: Robot, index: int) -> Robot:
-    motors = tuple(
-        replace(motor, sense=-motor.sense) if k == index else motor
-        for k, motor in enumerate(robot.motors)
-    )
-    return replace(robot, profile=replace(robot.profile, motors=motors))
 
 
 def best_payload(part: SettlingFit, robot: Robot) -> tuple[float, str]:
@@ -353,7 +273,9 @@ def best_payload(part: SettlingFit, robot: Robot) -> tuple[float, str]:
     sag = np.abs(np.asarray(part.settling.compliance) * largest_load(robot, 0.0))
     if sag.max() < LEAST_SAG_RAD:
         return 0.0, "payload: the motors do not give way, so none can be told"
-    gain = np.array([_refit(part, robot, kg).log_posterior for kg in PAYLOADS_KG])
+    seen = part.observations
+    loaded = [uncalibrated(robot, seen.of_motors, payload=kg) for kg in PAYLOADS_KG]
+    gain = np.array([fit_settling(seen.of(model)).log_posterior for model in loaded])
     gain -= part.log_posterior
     best = int(np.argmax(gain))
     if gain[best] > SURE_NATS:
@@ -364,9 +286,3 @@ def best_payload(part: SettlingFit, robot: Robot) -> tuple[float, str]:
         f"(best {PAYLOADS_KG[best]:g} kg, {gain[best]:+.1f} nats against none); weigh it, or run "
         "the same movements with and without it"
     )
-
-
-def _refit(part: SettlingFit, robot: Robot, payload: float) -> SettlingFit:
-    """Return the fit of another description to the very same movements."""
-    seen = part.observations
-    return fit_settling(seen.of(uncalibrated(robot, seen.of_motors, payload=payload)))

@@ -16,7 +16,6 @@ from failuretwin.connection.fleet.messages import (
     MOST_EVENTS,
     ProfileMessage,
     events_binary,
-    events_json,
     profile_json,
 )
 from failuretwin.connection.links.base import Event, Source
@@ -36,7 +35,7 @@ class Publisher:
         broker: The server.
         tell: Takes a line for the user.
         stop: Ends the wait for a server that takes no messages.
-        motors: Number of motors, for the compact form; None: JSON.
+        motors: Number of motors of each robot.
 
     Attributes:
         sent: Messages that the server has stored.
@@ -47,7 +46,7 @@ class Publisher:
         broker: Broker,
         tell: Callable[[str], None],
         stop: asyncio.Event,
-        motors: int | None = None,
+        motors: int,
     ) -> None:
         self.sent = self._made = 0
         self._stop = stop
@@ -63,13 +62,12 @@ class Publisher:
     async def send(self, events: Iterable[tuple[str, Sequence[Event]]]) -> None:
         """Send events of robots, one item of each robot; empty ones are left out."""
         await self._send(
-            [(f"{IN}.{robot}.events", self._packed(some)) for robot, some in events if some]
+            [
+                (f"{IN}.{robot}.events", events_binary(some, self._motors))
+                for robot, some in events
+                if some
+            ]
         )
-
-    def _packed(self, events: Sequence[Event]) -> bytes:
-        if self._motors is None:
-            return events_json(events)
-        return events_binary(events, self._motors)
 
     async def _send(self, messages: Sequence[tuple[str, bytes]]) -> None:
         for first in range(0, len(messages), TOGETHER):

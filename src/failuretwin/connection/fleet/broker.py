@@ -48,6 +48,8 @@ LARGEST_STREAM = 2 * 1024**3
 """Room for events that no snapshot covers [bytes]."""
 ALARMS_KEPT_S = 90 * 86_400.0
 """Time for which alarms are kept [s]."""
+ANSWER_S = 5.0
+"""Longest wait for the entries of a bucket [s]."""
 TRIES_S = 2.0
 """Time between two tries to reach a server that is gone [s]."""
 
@@ -131,7 +133,7 @@ class Broker:
 
         once = StreamConfig(
             name=ALARM_STREAM,
-            subjects=[f"{ALARM}.>"],
+            subjects=[f"{ALARM}.*.*.*.*"],  # not those of retained MQTT messages
             max_msgs_per_subject=1,
             discard=DiscardPolicy.NEW,
             discard_new_per_subject=True,
@@ -160,7 +162,8 @@ class Broker:
 
         with suppress(Error, OSError, TimeoutError):
             await self.client.flush(timeout=2)
-        await self.client.close()
+        with suppress(Error, OSError, TimeoutError):  # the server is gone
+            await self.client.close()
 
     async def publish_once(self, subject: str, data: bytes) -> bool:
         """Store a message unless its subject has one, and return whether it is new."""
@@ -177,6 +180,17 @@ class Broker:
 
 PER_SUBJECT = 10077
 """Error code of a stream whose subject holds a message already."""
+
+
+async def entries(bucket: KeyValue) -> dict[str, KeyValue.Entry]:
+    """Return all entries of a bucket by key."""
+    watcher, found = await bucket.watchall(ignore_deletes=True), dict[str, Any]()
+    try:
+        while (entry := await watcher.updates(timeout=ANSWER_S)) is not None:
+            found[entry.key] = entry
+    finally:
+        await watcher.stop()
+    return found
 
 
 async def open_broker(access: Access, name: str) -> Broker:

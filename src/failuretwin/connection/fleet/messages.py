@@ -184,30 +184,13 @@ def profile_json(message: ProfileMessage) -> bytes:
     return json.dumps({"profile": message.profile, "calibration": message.calibration}).encode()
 
 
-def events_json(events: Sequence[Event]) -> bytes:
-    """Return readings and commands as a message for people; empty readings are left out."""
-    readings, commands = _parts(events)
-    table = {
-        "readings": [{"t": one.time, "tool": one.tool.tolist()} for one in readings],
-        "commands": [
-            {"t": one.time, "target": one.target.tolist(), "duration": one.duration.tolist()}
-            for one in commands
-        ],
-    }
-    return json.dumps(table).encode()
-
-
 def events_binary(events: Sequence[Event], motors: int) -> bytes:
     """Return readings and commands as a compact message; empty readings are left out."""
-    readings, commands = _parts(events)
+    readings = [one for one in events if isinstance(one, Reading) and np.isfinite(one.tool).all()]
+    commands = [one for one in events if isinstance(one, CommandSent)]
     parts = (
         [[one.time, *one.tool] for one in readings],
         [[one.time, *one.target, *one.duration] for one in commands],
     )
     header = HEADER.pack(MAGIC, motors, len(readings), len(commands))
     return b"".join([header, *(np.array(part, dtype="<f8").tobytes() for part in parts)])
-
-
-def _parts(events: Sequence[Event]) -> tuple[list[Reading], list[CommandSent]]:
-    readings = [one for one in events if isinstance(one, Reading) and np.isfinite(one.tool).all()]
-    return readings, [one for one in events if isinstance(one, CommandSent)]

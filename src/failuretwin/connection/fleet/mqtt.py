@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 from urllib.parse import unquote, urlsplit
@@ -23,12 +24,15 @@ class Retained:
         url: ``mqtt://[USER:PASSWORD@]HOST[:PORT]``, or ``mqtts://``; None: nowhere.
         name: Our name there.
         tell: Takes a line for the user.
+        ca: File of the authority that signs the broker's certificate; None: those of the system.
 
     Raises:
         InputError: If the URL is none, or nobody answers.
     """
 
-    def __init__(self, url: str | None, name: str, tell: Callable[[str], None]) -> None:
+    def __init__(
+        self, url: str | None, name: str, tell: Callable[[str], None], ca: Path | None = None
+    ) -> None:
         self._client: Client | None = None
         if url is None:
             return
@@ -42,7 +46,7 @@ class Retained:
         if parts.username:
             client.username_pw_set(parts.username, unquote(parts.password or ""))
         if parts.scheme == "mqtts":
-            client.tls_set()
+            client.tls_set(None if ca is None else str(ca))
         port = parts.port or PORTS[parts.scheme]
         try:
             client.connect(parts.hostname, port)

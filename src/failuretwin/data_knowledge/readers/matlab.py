@@ -37,10 +37,6 @@ PATH_COLUMNS = 6
 SAME_PATH_M = 1e-6
 """Commands belong to a desired path if their kinematics differ from it by less than this [m]."""
 HEALTHY_LABEL = "Healthy"
-RECOVERY_ERROR = "recovery_error_m"
-"""Attribute of a run set: largest distance of recovered commands from the desired path [m]."""
-RECOVERY_WORST = "recovery_worst_run"
-"""Attribute of a run set: the run in which that is."""
 
 
 @dataclass(frozen=True)
@@ -78,15 +74,13 @@ def _natural_order(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
 
 
-def read_matlab_file(path: Path, robot: Robot, *, approximate: bool = False) -> RunTable:
+def read_matlab_file(path: Path, robot: Robot) -> RunTable:
     """Read the run or the runs of a published MATLAB file.
 
     Args:
         path: A cell-array file, or `dataset_i.mat` with `hidden_dataset_i.mat` beside it; without
             the latter the commands are recovered.
         robot: The robot that the runs are of.
-        approximate: Accept commands that reproduce the desired path only in the least-squares
-            sense.
 
     Raises:
         InputError: If the file is none of these, or the commands cannot be recovered.
@@ -96,14 +90,14 @@ def read_matlab_file(path: Path, robot: Robot, *, approximate: bool = False) -> 
         if runs in content:
             texts = [str(np.ravel(cell)[0]) for cell in np.ravel(content.get(labels, []))]
             paths = _cell_paths(path, list(np.ravel(content[runs])), runs, texts, robot)
-            return _recovered(paths, robot, approximate)
+            return _recovered(paths, robot)
     if "dataset" in content:
         hidden = path.with_name(f"hidden_{path.name}")
         name = f"{path.parent.name}/{path.stem}"
         run = _Paths(name, *_split_paths(content["dataset"], str(path)), path.parent.name)
         if hidden.exists():
             return _pair_run(run, hidden, path, robot)
-        return _recovered([run], robot, approximate)
+        return _recovered([run], robot)
     present = ", ".join(name for name in content if not name.startswith("__")) or "nothing"
     hint = " Give the folder, or the dataset_i.mat beside it." if "hidden" in path.name else ""
     raise InputError(
@@ -146,17 +140,12 @@ def _cell_paths(
     return paths
 
 
-def _recovered(paths: Sequence[_Paths], robot: Robot, approximate: bool) -> RunTable:
-    """Return runs with commands recovered from their desired paths, and the error of recovery."""
+def _recovered(paths: Sequence[_Paths], robot: Robot) -> RunTable:
+    """Return runs with commands recovered from their desired paths."""
     desired, names = np.stack([run.desired for run in paths]), [run.name for run in paths]
-    time, movements = recover_movements(desired, robot, names=names, approximate=approximate)
-    path = DigitalTwin(robot).path(movements.reference(time))
-    off = np.linalg.norm(path - desired, axis=-1).max(axis=1)
-    worst = int(np.argmax(off))
+    time, movements = recover_movements(desired, robot, names=names)
     shifted = replace(movements, start=movements.start - time[0])
-    table = _table(paths, time - time[0], shifted, READING_RATE_HZ, robot)
-    attributes = {RECOVERY_ERROR: float(off[worst]), RECOVERY_WORST: names[worst]}
-    return replace(table, attributes=attributes)
+    return _table(paths, time - time[0], shifted, READING_RATE_HZ, robot)
 
 
 def _pair_run(run: _Paths, hidden: Path, path: Path, robot: Robot) -> RunTable:

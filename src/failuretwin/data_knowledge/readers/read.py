@@ -27,8 +27,6 @@ from failuretwin.data_knowledge.readers.lerobot import (
 )
 from failuretwin.data_knowledge.readers.lerobot_units import LeRobotAngles
 from failuretwin.data_knowledge.readers.matlab import (
-    RECOVERY_ERROR,
-    RECOVERY_WORST,
     find_matlab_files,
     read_matlab_file,
 )
@@ -63,8 +61,6 @@ class ReadOptions:
         columns: Roles and units of the columns of CSV files.
         lerobot: Unit and sense of the numbers of LeRobot data sets.
         topics: Roles of the topics of bags, where their types leave a choice.
-        approximate: Published paths without commands: accept commands that reproduce the desired
-            path only in the least-squares sense.
     """
 
     how: As = "measured"
@@ -72,7 +68,6 @@ class ReadOptions:
     columns: ColumnMap | None = None
     lerobot: LeRobotAngles | None = None
     topics: BagTopics | None = None
-    approximate: bool = False
 
 
 def sample_log() -> Path:
@@ -133,11 +128,7 @@ def read_logs(
         for some in found:
             parts += some
             on_progress(1)
-    runs = concatenate(parts)
-    worst = max(parts, key=lambda part: float(part.attrs.get(RECOVERY_ERROR, -1.0)))
-    if RECOVERY_ERROR in worst.attrs:  # the worst of several files is reported
-        runs.attrs |= {name: worst.attrs[name] for name in (RECOVERY_ERROR, RECOVERY_WORST)}
-    return runs
+    return concatenate(parts)
 
 
 def as_runs(runs: RunsLike, robot: Robot | str = "armpi_fpv") -> RunSet:
@@ -246,9 +237,8 @@ def _read_session(folder: Path, robot: Robot, options: ReadOptions) -> list[RunS
 
 
 def _read_matlab(path: Path, robot: Robot, options: ReadOptions) -> list[RunSet]:
-    runs = read_matlab_file(path, robot, approximate=options.approximate).to_dataset()
-    choice = {"approximate": options.approximate}
-    return [_named(runs, robot, "published MATLAB file", choice)]
+    runs = read_matlab_file(path, robot).to_dataset()
+    return [_named(runs, robot, "published MATLAB file", {})]
 
 
 def _read_csv(path: Path, robot: Robot, options: ReadOptions) -> list[RunSet]:

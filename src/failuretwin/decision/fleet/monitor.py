@@ -129,11 +129,12 @@ class FleetMonitor:
     # State: arrays with a row for each robot, and the alarms as tables.
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return what is known of all robots, by name; the first axis is the robot."""
+        """Return what is known of all robots, by name; the first axis is the robot.
+
+        What `judge` computes again is left out, such as the belief in the present movement.
+        """
         found = self.fleet.state() | {"movements": self._movements}
-        for name, belief in (("concluded", self._concluded), ("present", self._present)):
-            found |= belief.to_arrays(name)
-        return found
+        return found | self._concluded.to_arrays("concluded")
 
     def alarms(self) -> list[dict[str, Any]]:
         """Return the alarm of each robot, and what its rule counts, as a table."""
@@ -152,8 +153,7 @@ class FleetMonitor:
         known = len(alarms)
         self.fleet.restore(state)
         self._movements[:known] = state["movements"]
-        for name, belief in (("concluded", self._concluded), ("present", self._present)):
-            belief[:known].from_arrays(name, state)
+        self._concluded[:known].from_arrays("concluded", state)
         for rule, table in zip(self._rules[:known], alarms, strict=True):
             rule.alarm = from_table(Alarm, table["alarm"], "alarm")
             for name in RULE:

@@ -28,7 +28,7 @@ from failuretwin.core.hypothesis import ALL_CLEAR, RAISED, Alarm, Episode
 from failuretwin.decision.fleet.monitor import FleetMonitor
 from failuretwin.inference.diagnoser import BayesDiagnoser
 
-FORMAT = 1
+FORMAT = 2
 """Format of a snapshot."""
 FIRST_ROOM = 8
 """Robots of a kind that there is room for at first."""
@@ -178,6 +178,7 @@ class Partition:
         resolve: Finds the method for a profile.
         budget: False alarms in 100 hours that are allowed of each robot.
         announced: Profiles that were announced before the first message, by robot.
+        last: Number of the last message before the first.
     """
 
     def __init__(
@@ -185,9 +186,10 @@ class Partition:
         resolve: Resolve,
         budget: float = 1.0,
         announced: Mapping[str, ProfileMessage] | None = None,
+        last: int = 0,
     ) -> None:
         self.counts: Counter[str] = Counter()
-        self.last = 0
+        self.last = last
         self.announced = dict(announced or {})
         self.refused: set[str] = set()
         self._resolve, self._budget = resolve, budget
@@ -345,7 +347,7 @@ class Partition:
         }
         arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
         buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, **arrays)
+        np.savez_compressed(buffer, allow_pickle=False, **arrays)
         return buffer.getvalue()
 
     @classmethod
@@ -355,6 +357,13 @@ class Partition:
         Raises:
             InputError: If it is of another format.
         """
+        try:
+            return cls._restored(data, resolve, budget)
+        except (KeyError, ValueError) as error:
+            raise InputError(f"a snapshot that lacks something ({error!r:.200}).") from error
+
+    @classmethod
+    def _restored(cls, data: bytes, resolve: Resolve, budget: float) -> Partition:
         with np.load(io.BytesIO(data), allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         header = json.loads(arrays.pop("header").tobytes())

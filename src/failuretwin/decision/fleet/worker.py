@@ -15,7 +15,6 @@ import asyncio
 import json
 import math
 import time
-import uuid
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -23,15 +22,15 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from failuretwin.connection.fleet import broker as names
-from failuretwin.connection.fleet.broker import Broker
+from failuretwin.connection.fleet.broker import Broker, entries
 from failuretwin.connection.fleet.messages import ProfileMessage, parse_profile
 from failuretwin.core.errors import InputError, counted
 from failuretwin.decision.fleet.metrics import Metrics
 from failuretwin.decision.fleet.partition import PROFILE, AlarmChange, Envelope, Partition, Resolve
+from failuretwin.decision.fleet.snapshots import LeaseLostError, Snapshots
+from failuretwin.decision.fleet.source import MessageSource
 
 if TYPE_CHECKING:
-    from nats.aio.msg import Msg
-    from nats.js.client import JetStreamContext
     from nats.js.kv import KeyValue
     from nats.js.object_store import ObjectStore
 
@@ -43,8 +42,8 @@ UNCHANGED, FORGOTTEN = 4, 40
 which the name of a worker is deleted."""
 CYCLE_S = 0.5
 """Least time between two fetches [s], so that many robots are judged together."""
-FETCH, FETCH_S = 4000, 1.0
-"""Messages that are fetched at once at most, and how long to wait for the first [s]."""
+FETCH = 4000
+"""Messages that are fetched at once at most."""
 HEALTH_S = 2.0
 """Time between two reports of health [s]."""
 SILENCE_S = 10.0
@@ -52,16 +51,8 @@ SILENCE_S = 10.0
 BEHIND_S = 10.0
 """Delay from which a worker says that it cannot follow [s]."""
 STALE = "stale"
-
-
-ANSWER_S = 5.0
-"""Longest wait for the entries of a bucket [s]."""
 ABANDON_S = 5.0
 """Longest wait for work that is abandoned [s]."""
-
-
-class LeaseLostError(Exception):
-    """Somebody else holds the partition by now."""
 
 
 @dataclass(frozen=True)
@@ -149,8 +140,7 @@ class Worker:
             await self._look()
             with suppress(TimeoutError):
                 await asyncio.wait_for(stop.wait(), RENEW_S)
-        for holder in list(self._held.values()):
-            await self._release(holder)
+        await asyncio.gather(*map(self._release, list(self._held.values())))
         with suppress(Exception):
             await self.buckets.workers.delete(self.settings.name)
         self._computer.shutdown()
@@ -253,7 +243,7 @@ class _Watched:
 
     async def look(self, bucket: KeyValue) -> None:
         """Look at all entries."""
-        found = {key: entry.revision or 0 for key, entry in (await _entries(bucket)).items()}
+        found = {key: entry.revision or 0 for key, entry in (await entries(bucket)).items()}
         self._looks = {
             key: self._looks[key] + 1 if self.revisions.get(key) == revision else 0
             for key, revision in found.items()
@@ -263,17 +253,6 @@ class _Watched:
     def unchanged(self, looks: int) -> set[str]:
         """Return the keys that have not changed for some looks."""
         return {key for key, count in self._looks.items() if count >= looks}
-
-
-async def _entries(bucket: KeyValue) -> dict[str, KeyValue.Entry]:
-    """Return all entries of a bucket by key."""
-    watcher, found = await bucket.watchall(ignore_deletes=True), dict[str, Any]()
-    try:
-        while (entry := await watcher.updates(timeout=ANSWER_S)) is not None:
-            found[entry.key] = entry
-    finally:
-        await watcher.stop()
-    return found
 
 
 @dataclass
@@ -291,18 +270,13 @@ class _Holder:
     def __init__(self, worker: Worker, number: int, lease: int) -> None:
         self.number, self.key, self.lease = number, f"p{number}", lease
         self._worker = worker
-        self._subject = f"{names.BY_PARTITION}.{number}.>"
         self._stop = asyncio.Event()
-        self._pointer = 0
-        self._object = ""
-        self._expected = 0
-        self._last_message: Msg | None = None
+        self._source = MessageSource(worker.broker.stream, number)
+        self._snapshots = Snapshots(worker.buckets.snapshots, worker.buckets.states, self.key)
         self._saved_s, self._saved = time.monotonic(), 0
-        self._skew_s = math.inf
-        self._pending, self._taken = 0, 0
+        self._lag_s, self._taken = 0.0, 0
         self._reported = _Reported()
         self._careful = self._abandoned = False
-        self._source: JetStreamContext.PullSubscription | None = None
         self._partition: Partition
         self.task = asyncio.create_task(self._run())
 
@@ -337,7 +311,7 @@ class _Holder:
             self._worker.outlets.tell(f"partition {self.number}: {_short(error)}")
             raise
         finally:
-            await self._close()
+            await self._source.close()
 
     async def _begin(self) -> None:
         """Go on from the last snapshot, or begin anew with the profiles that are known."""
@@ -352,98 +326,39 @@ class _Holder:
         )
 
     async def _load(self) -> None:
-        from nats.js.errors import KeyNotFoundError
-
-        buckets, settings = self._worker.buckets, self._worker.settings
-        try:
-            entry = await buckets.snapshots.get(self.key)
-        except KeyNotFoundError:
-            announced = await self._announced()
-            self._partition = Partition(self._worker.resolve, settings.budget, announced)
-            return
-        self._pointer = entry.revision or 0
-        self._object = json.loads(entry.value or b"{}")["object"]
-        data = (await buckets.states.get(self._object)).data or b""
-        self._partition = await self._worker.compute(
-            Partition.restored, data, self._worker.resolve, settings.budget
-        )
+        worker, budget, last = self._worker, self._worker.settings.budget, 0
+        stored = await self._snapshots.load()
+        if stored is not None:
+            data, last = stored
+            try:
+                self._partition = await worker.compute(
+                    Partition.restored, data, worker.resolve, budget
+                )
+                return
+            except InputError as error:  # of another version, in an upgrade
+                worker.outlets.tell(f"partition {self.number}: {error} Its robots begin anew.")
+        self._partition = Partition(worker.resolve, budget, await self._announced(), last)
 
     async def _announced(self) -> dict[str, ProfileMessage]:
         """Return the profiles that are known of all robots."""
         found = {}
-        for name, entry in (await _entries(self._worker.buckets.profiles)).items():
+        for name, entry in (await entries(self._worker.buckets.profiles)).items():
             with suppress(InputError):
                 found[name] = parse_profile(entry.value or b"")
         return found
 
-    async def _open(self) -> JetStreamContext.PullSubscription:
-        """Return a source of the messages that come after the last one taken."""
-        from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
-
-        stream, name = self._worker.broker.stream, f"{self.key}_{uuid.uuid4().hex[:8]}"
-        await stream.add_consumer(
-            names.EVENTS_STREAM,
-            ConsumerConfig(
-                durable_name=name,
-                deliver_policy=DeliverPolicy.BY_START_SEQUENCE,
-                opt_start_seq=self._partition.last + 1,
-                ack_policy=AckPolicy.ALL,
-                ack_wait=3600.0,
-                max_ack_pending=-1,
-                filter_subject=self._subject,
-                inactive_threshold=60.0,
-            ),
-        )
-        self._expected = 1
-        return await stream.pull_subscribe_bind(consumer=name, stream=names.EVENTS_STREAM)
-
-    async def _close(self) -> None:
-        """Leave the source; the server forgets it."""
-        source, self._source = self._source, None
-        if source is not None:
-            with suppress(Exception):
-                await source.unsubscribe()
-
     async def _step(self) -> bool:
         """Take what has come, and return whether there may be more at once."""
-        from nats.errors import Error
-
-        try:
-            self._source = self._source or await self._open()
-            messages = await self._source.fetch(1 if self._careful else FETCH, timeout=FETCH_S)
-        except TimeoutError:
-            self._pending = 0
-            return False
-        except (Error, OSError):
-            await self._close()
-            return False
-        envelopes, whole = self._envelopes(messages)
-        await self._take(envelopes)
-        if not whole:  # some were lost on the way: ask for them again
-            await self._close()
-        return len(messages) >= FETCH
-
-    def _envelopes(self, messages: list[Msg]) -> tuple[list[Envelope], bool]:
-        """Return messages in their order, up to a gap, and whether there was none."""
-        found, now = list[Envelope](), time.time()
-        for one in messages:
-            tokens = one.reply.split(".")
-            at = 5 if len(tokens) == TOKENS else 7
-            number, delivery, stamp, pending = map(int, tokens[at : at + 4])
-            if delivery != self._expected:
-                return found, False
-            self._expected += 1
-            self._pending, self._last_message = pending, one
-            server_s = 1e-9 * stamp
-            self._skew_s = min(self._skew_s, now - server_s)
-            robot, kind = one.subject.split(".", 4)[3:]
-            found.append(Envelope(number, server_s, robot, kind, one.data))
-        return found, True
+        most = 1 if self._careful else FETCH
+        envelopes = await self._source.fetch(self._partition.last, most)
+        if envelopes:
+            await self._take(envelopes)
+        else:
+            self._lag_s = 0.0
+        return len(envelopes) >= FETCH
 
     async def _take(self, envelopes: list[Envelope]) -> None:
         """Filter messages, then say what has changed."""
-        if not envelopes:
-            return
         for one in envelopes:
             if one.kind == PROFILE:
                 with suppress(InputError):
@@ -454,6 +369,7 @@ class _Holder:
         except Exception as error:  # a message that breaks the filter must end no worker
             await self._refuse(envelopes, error)
             return
+        self._lag_s = max(0.0, self._source.server_now() - envelopes[-1].server_s)
         self._taken += len(envelopes)
         self._worker.outlets.metrics.messages.inc(len(envelopes))
         for change in changes:
@@ -468,7 +384,7 @@ class _Holder:
         self._careful = len(envelopes) > 1
         await self._patiently(self._load)
         self._partition.refused |= refused
-        await self._close()
+        await self._source.close()
 
     async def _tell(self, change: AlarmChange) -> None:
         """Store a change of an alarm; one that was stored before is not new."""
@@ -508,7 +424,11 @@ class _Holder:
             return
         data = await self._worker.compute(self._partition.snapshot)
         try:
-            await self._store(data, last)
+            await self._snapshots.store(data, last)
+            await self._source.acknowledge()
+            await self._worker.broker.stream.purge_stream(
+                names.EVENTS_STREAM, subject=self._source.subject, seq=last + 1
+            )
         except (Error, OSError, TimeoutError) as error:
             said = f"partition {self.number}: no snapshot ({_short(error)}); trying again"
             self._worker.outlets.tell(said)
@@ -518,52 +438,23 @@ class _Holder:
         metrics.snapshot_bytes.labels(self.key).set(len(data))
         metrics.snapshot_seconds.observe(time.monotonic() - begun_s)
 
-    async def _store(self, data: bytes, last: int) -> None:
-        from nats.js.errors import KeyWrongLastSequenceError, NotFoundError
-
-        buckets, stream = self._worker.buckets, self._worker.broker.stream
-        name, old = f"{self.key}-{last}-{uuid.uuid4().hex[:8]}", self._object
-        await buckets.states.put(name, data)
-        pointer = json.dumps({"object": name, "last": last}).encode()
-        # Only who has written the last pointer, or read it when taking over, may replace it.
-        try:
-            self._pointer = await buckets.snapshots.update(self.key, pointer, last=self._pointer)
-        except KeyWrongLastSequenceError:
-            await buckets.states.delete(name)
-            entry = await buckets.snapshots.get(self.key)
-            if json.loads(entry.value or b"{}")["last"] > last:  # we were paused for long
-                raise LeaseLostError(f"partition {self.number} has gone on without us") from None
-            self._pointer = entry.revision or 0  # the other was
-            raise
-        self._object = name
-        if old:
-            with suppress(NotFoundError):
-                await buckets.states.delete(old)
-        message, self._last_message = self._last_message, None
-        if message is not None:
-            await message.ack()
-        await stream.purge_stream(names.EVENTS_STREAM, subject=self._subject, seq=last + 1)
-
     async def _report(self) -> None:
         """Publish health and lag now and then; robots whose state changes by themselves."""
         now_s, before = time.monotonic(), self._reported
         if now_s - before.at_s < HEALTH_S:
             return
-        server_now = time.time() - self._skew_s if math.isfinite(self._skew_s) else time.time()
         robots = self._partition.health()
         for table in robots.values():
-            if server_now - table["heard"] > SILENCE_S and self._pending == 0:
+            if self._source.heard_to_s - table["heard"] > SILENCE_S and self._source.pending == 0:
                 table["state"] = STALE
-        heard = max((table["heard"] for table in robots.values()), default=server_now)
-        lag_s = max(0.0, server_now - heard) if self._pending else 0.0
         rate = self._taken / (now_s - before.at_s) if math.isfinite(before.at_s) else 0.0
         report = {
             "worker": self._worker.settings.name,
             "at": time.time(),
             "robots": robots,
             "counts": dict(self._partition.counts),
-            "pending": self._pending,
-            "lag_s": round(lag_s, 3),
+            "pending": self._source.pending,
+            "lag_s": round(self._lag_s, 3),
             "messages_per_s": round(rate, 1),
         }
         self._taken = 0
@@ -571,12 +462,11 @@ class _Holder:
         changed = {
             name: robots[name] for name, now in states.items() if before.states.get(name) != now
         }
-        behind = lag_s > BEHIND_S
+        behind = self._lag_s > BEHIND_S
         if behind != before.behind:
-            said = f"cannot follow: {self._pending} messages, {lag_s:.0f} s behind; nothing is lost"
-            self._worker.outlets.tell(
-                f"partition {self.number}: {said if behind else 'follows again'}"
-            )
+            waiting = f"{self._source.pending} messages, {self._lag_s:.0f} s behind"
+            said = f"cannot follow: {waiting}; nothing is lost" if behind else "follows again"
+            self._worker.outlets.tell(f"partition {self.number}: {said}")
         self._reported = _Reported(now_s, states, behind)
         self._worker.outlets.metrics.report(self.key, report)
         await self._publish_health(report, changed)
@@ -601,5 +491,3 @@ def _short(error: Exception) -> str:
 
 LONGEST_REASON = 200
 """Longest text of an error that is told [characters]."""
-TOKENS = 9
-"""Parts of the reply address of a delivered message, where it names no domain."""

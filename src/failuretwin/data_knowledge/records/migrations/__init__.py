@@ -1,6 +1,7 @@
 """Migrations of the store's schema by alembic, which is loaded only to change tables.
 
-A new revision is a module in `versions` and the name in `HEAD`.
+A new store gets the tables of `schema`; an older one is brought there by the revisions after its
+own. A new revision is a module in `versions` and the name in `HEAD`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from typing import TYPE_CHECKING
 import sqlalchemy as sa
 
 from failuretwin.core.errors import needs_extra
+from failuretwin.data_knowledge.records.migrations.append_only import guard
+from failuretwin.data_knowledge.records.schema import metadata
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -56,10 +59,15 @@ def stated_revision(connection: sa.Connection) -> str | None:
     return connection.scalar(sa.select(revision).select_from(sa.table(REVISION_TABLE)))
 
 
-def upgrade(connection: sa.Connection, revision: str = HEAD) -> None:
-    """Bring a database to a revision, within the transaction of the connection."""
+def upgrade(connection: sa.Connection) -> None:
+    """Make the tables of a new store, or bring an older one to `HEAD`, in one transaction."""
     config = _config()
     from alembic import command
 
     config.attributes["connection"] = connection
-    command.upgrade(config, revision)
+    if revision_of(connection) is None:
+        metadata.create_all(connection)
+        guard(connection)
+        command.stamp(config, HEAD)
+    else:
+        command.upgrade(config, HEAD)
