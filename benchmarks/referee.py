@@ -92,9 +92,9 @@ def sampled_evidence(
     off = f[:, some] - prior_mean
     total = -0.5 * np.sum(off @ inverse * off, axis=1) - log_q
     total -= 0.5 * np.linalg.slogdet(2.0 * np.pi * prior)[1]
-    for m in np.flatnonzero(usable[0]):
+    for m in np.flatnonzero(usable[0]).tolist():
         here = f[:, m * channels : (m + 1) * channels]
-        total += _moment(part, int(m), here, noise.dof, noise.log_outlier)
+        total += _moment(part, m, here, noise.dof, noise.log_outlier)
     weight = np.exp(total - total.max())
     deviation = float(weight.std() / weight.mean() / np.sqrt(draws))
     return float(logsumexp(total) - np.log(draws)), deviation
