@@ -182,6 +182,7 @@ def fetch(names: tuple[str, ...], source: Path | None, data: Path) -> None:
         official = simulated.official()
         with progress_bar("data sets", len(official)) as advance:
             for key in official:
-                simulated.load_set(*key.split("/"), data)
+                arm, _, part = key.partition("/")
+                simulated.load_set(arm, part, data)
                 advance(1)
         tell(f"simulated: {len(official)} data sets as published")

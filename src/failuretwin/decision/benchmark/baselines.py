@@ -11,7 +11,7 @@ from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
 from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis
 from failuretwin.core.runs import truth_of
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.decision.learned.feature_encoder import Signals, expectation_of, signals_of
 from failuretwin.digital_model.arm_classes import class_of, generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections
@@ -109,7 +109,7 @@ class KalmanBank(Calibrated):
         self,
         signals: Signals,
         faults: tuple[Fault, ...],
-        motors: tuple[str, ...],
+        motors: list[str],
         runs: xr.Dataset,
     ) -> FloatArray:
         """Return the log likelihood of one hypothesis for each run, (run,) [nats]."""
@@ -140,14 +140,15 @@ class KalmanBank(Calibrated):
                 first[motor] += HELD_RAD**2
             else:
                 jump[motor] = (JUMP * still) ** 2
-        moving = np.abs(np.diff(command, axis=1, prepend=command[:, :1])).max(axis=2) > 1e-5
+        speed = np.abs(np.diff(command, axis=1, prepend=command[:, :1])).max(axis=2)
+        moving = np.asarray(speed > 1e-5)
         return self._filtered(signals, angle, moving, first, drift, jump)
 
     def _filtered(
         self,
         signals: Signals,
         angle: FloatArray,
-        moving: FloatArray,
+        moving: BoolArray,
         first: FloatArray,
         drift: FloatArray,
         jump: FloatArray,

@@ -117,7 +117,8 @@ Scorer = Callable[[Judgement], list[Score]]
 
 def _share(metric: str, flags: Sequence[bool]) -> Score:
     share = scoring.Share(int(sum(flags)), len(flags))
-    return Score(metric, 100.0 * share.value, *(100.0 * end for end in share.interval), share.total)
+    low, high = share.interval
+    return Score(metric, 100.0 * share.value, 100.0 * low, 100.0 * high, share.total)
 
 
 def _mean(metric: str, values: FloatArray) -> Score:
