@@ -153,19 +153,20 @@ class KalmanBank(Calibrated):
         drift: FloatArray,
         jump: FloatArray,
     ) -> FloatArray:
-        path, jacobian = self.twin.path_and_jacobian(angle)
+        steps = np.flatnonzero(signals.seen.any(axis=0))
+        path, jacobian = self.twin.path_and_jacobian(angle[:, steps])
         runs, motors = len(angle), angle.shape[2]
         state = np.zeros((runs, motors))
         spread = np.broadcast_to(np.diag(first + jump), (runs, motors, motors)).copy()
         noise = (SENSOR_OF_REACH * self.twin.robot.reach) ** 2 * np.eye(3)
         total, was_moving = np.zeros(runs), np.zeros(runs, dtype=bool)
-        for step in np.flatnonzero(signals.seen.any(axis=0)):
+        for place, step in enumerate(steps):
             seen = signals.seen[:, step] & ~moving[:, step]  # poses at rest alone
             starts = moving[:, step] & ~was_moving
             was_moving = moving[:, step]
             spread += np.diag(drift) + starts[:, None, None] * np.diag(jump)
-            rows = jacobian[:, step]
-            innovation = signals.measured[:, step] - path[:, step]
+            rows = jacobian[:, place]
+            innovation = signals.measured[:, step] - path[:, place]
             innovation = innovation - np.einsum("ram,rm->ra", rows, state)
             innovation = np.where(seen[:, None], innovation, 0.0)
             cross = np.einsum("rmn,ran->rma", spread, rows)
@@ -175,7 +176,9 @@ class KalmanBank(Calibrated):
             total += np.where(seen, fit, 0.0)
             gain = np.einsum("rma,rab->rmb", cross, known) * seen[:, None, None]
             state = state + np.einsum("rma,ra->rm", gain, innovation)
-            spread = spread - np.einsum("rma,rna->rmn", gain, cross)
+            left = np.eye(motors) - np.einsum("rma,ran->rmn", gain, rows)
+            spread = np.einsum("rmn,rnk,rlk->rml", left, spread, left)  # Joseph's form
+            spread += np.einsum("rma,ab,rnb->rmn", gain, noise, gain)
         return total / CORRELATION
 
 
