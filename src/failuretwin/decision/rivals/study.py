@@ -153,6 +153,9 @@ def make_rival_data(plan: RivalPlan, robot: Robot, exam: Exam, folder: Path) -> 
 
 # One job.
 
+Answer = Callable[[], FloatArray]
+"""Returns the logits or the probabilities of the test runs, (run, class)."""
+
 
 def run_rivals(
     plan: RivalPlan, robot: Robot, exam: Exam, out: Path, on_progress: Callable[[int], None]
@@ -174,7 +177,7 @@ def run_job(plan: RivalPlan, profile: str, folder: Path, job: RivalJob) -> None:
     """Write the diagnoses of one job, then its cost."""
     robot, test = load_robot(profile), load_run_set(folder / TEST)
     start = time.perf_counter()
-    answer = partial(_by_model, robot, folder, job, test)
+    answer: Answer = partial(_by_model, robot, folder, job, test)
     if job.method not in MODELS:
         answer = _by_training(plan, robot, folder, job, test)
     trained = time.perf_counter()
@@ -229,10 +232,6 @@ HYBRID_WEIGHTS = (0.8, 0.2)
 """Weights of Bayes and the network in the pool; stated before any test set was scored."""
 
 
-Answer = Callable[[], FloatArray]
-"""Returns the logits or the probabilities of the test runs, (run, class)."""
-
-
 def _by_training(
     plan: RivalPlan, robot: Robot, folder: Path, job: RivalJob, test: xr.Dataset
 ) -> Answer:
@@ -251,6 +250,7 @@ def _by_training(
     learn, judge = order[held:], order[:held]
     standard = Standard.of(features[learn])
     features, target = standard(features), standard(target)
+    answer: Answer
     if job.method in CLASSICAL:
         from failuretwin.decision.rivals import classical
 
@@ -311,7 +311,7 @@ class _Trainer:
             run = own.training(network, batches, *steps)
         for _ in run:
             pass
-        answer = partial(own.scores_of, network, target)
+        answer: Answer = partial(own.scores_of, network, target)
         if self.job.method == "fine-tuned":
             answer = partial(self._fine_tuned, network, target, truth)
         return own.scores_of(network, judge), answer
@@ -330,7 +330,7 @@ class _Trainer:
             others, these = fold_of != fold, fold_of == fold
             tuned = deepcopy(network)
             batches = own.shuffled_batches(target[others], truth[others], BATCH_RUNS, self.rng)
-            for _ in own.training(tuned, batches, steps, rate):
+            for _ in own.training(tuned, batches, steps if others.any() else 0, rate):
                 pass
             found[these] = own.scores_of(tuned, target[these])
         return found
