@@ -134,7 +134,8 @@ def test_the_study_in_small(armpi, tmp_path, monkeypatch):
             done.append(job)
             on_progress(1)
 
-    jobs = [job for job in study.rival_jobs(TINY) if job.method in SOME]
+    jobs = [j for j in study.rival_jobs(TINY) if j.method in SOME and j.twin == "imperfect"]
+    jobs.append(study.RivalJob("nearest", "published", 0))
     monkeypatch.setattr(study, "spread", one_by_one)
     monkeypatch.setattr(study, "rival_jobs", lambda plan: jobs)
     exam = stand_in_test_set(StudyPlan(0, stand_in_runs=TINY.stand_in_runs), armpi)

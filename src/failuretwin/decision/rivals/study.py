@@ -37,7 +37,7 @@ from failuretwin.decision.learned.paper_study import (
     class_names,
     spread,
 )
-from failuretwin.decision.results import write_json_lines
+from failuretwin.decision.results import read_results, write_json_lines
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.robot import Robot, load_robot
@@ -160,7 +160,7 @@ Answer = Callable[[], FloatArray]
 def run_rivals(
     plan: RivalPlan, robot: Robot, exam: Exam, out: Path, on_progress: Callable[[int], None]
 ) -> None:
-    """Run the jobs without a result; hybrids come last, since they need networks."""
+    """Run the jobs without a result; hybrids come last: they pool the answers of others."""
     begin(plan, robot, exam, out, make_rival_data)
     jobs, folder = rival_jobs(plan), out / WORK
     missing = [job for job in jobs if not (folder / ANSWERS / f"{job.name}.json").is_file()]
@@ -208,24 +208,21 @@ def _by_model(robot: Robot, folder: Path, job: RivalJob, test: xr.Dataset) -> Fl
     from failuretwin.inference.diagnoser import BayesDiagnoser
 
     names, known = class_names(robot), known_robot(robot, job.twin)
+    if job.method == "hybrid":
+        parts = (f"bayes_{job.twin}_0", f"cnn_{job.twin}_{job.repeat}")
+        stored = [read_results(folder / ANSWERS / f"{part}.jsonl").diagnoses for part in parts]
+        bayes, network = (np.array([[d.posterior[n] for n in names] for d in ds]) for ds in stored)
+        return log_pool(bayes, network, PoolWeights(*HYBRID_WEIGHTS))
     if job.method == "kalman":
         bank = KalmanBank(known.twin)
         if job.twin == IMPERFECT:
             bank.known[""] = known.imperfections
-        blind = test.assign_attrs(hypotheses=",".join(names), individual="")
-        found = bank.diagnose(blind)
+        found = bank.diagnose(test.assign_attrs(hypotheses=",".join(names), individual=""))
     elif job.method == "self-calibrating":
         found = SelfCalibratingDiagnoser(robot).diagnose(test)
     else:
         found = BayesDiagnoser(known.twin, known.imperfections).diagnose(test)
-    chances = np.array([[d.posterior[name] for name in names] for d in found])
-    if job.method != "hybrid":
-        return chances
-    from failuretwin.decision.results import read_results
-
-    other = read_results(folder / ANSWERS / f"cnn_{job.twin}_{job.repeat}.jsonl").diagnoses
-    network = np.array([[d.posterior[name] for name in names] for d in other])
-    return log_pool(chances, network, PoolWeights(*HYBRID_WEIGHTS))
+    return np.array([[d.posterior[name] for name in names] for d in found])
 
 
 HYBRID_WEIGHTS = (0.8, 0.2)
@@ -256,7 +253,8 @@ def _by_training(
 
         model = getattr(classical, CLASSICAL[job.method])(random_state=job.repeat)
         model.fit(features[learn], classes[learn])
-        held_out, answer = _logits(model, features[judge]), partial(_logits, model, target)
+        logits = partial(_logits, len(class_names(robot)), model)
+        held_out, answer = logits(features[judge]), partial(logits, target)
     else:
         truth = np.array([class_names(robot).index(str(f)) for f in test["fault"].values])
         trainer = _Trainer(plan, robot, job, rng)
@@ -267,8 +265,11 @@ def _by_training(
     return lambda: np.asarray(softmax(log_softmax(answer(), axis=1) / temperature, axis=1))
 
 
-def _logits(model: Any, features: Floats) -> FloatArray:
-    return np.asarray(np.log(np.maximum(model.predict_proba(features), LEAST)))
+def _logits(count: int, model: Any, features: Floats) -> FloatArray:
+    """Return log probabilities of `count` classes, (run, class)."""
+    chances = np.zeros((len(features), count))
+    chances[:, model.classes_] = model.predict_proba(features)
+    return np.asarray(np.log(np.maximum(chances, LEAST)))
 
 
 LEAST = 1e-6
