@@ -8,7 +8,7 @@ from executed import blocks, setup, teardown
 
 pytest_collect_file = Sybil(
     parsers=[blocks],
-    patterns=["store.md", "tutorials/*.md", "contributing/*.md", "reference/*.md"],
+    patterns=["benchmark.md", "store.md", "tutorials/*.md", "contributing/*.md", "reference/*.md"],
     setup=setup,
     teardown=teardown,
 ).pytest()

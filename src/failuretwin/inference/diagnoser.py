@@ -266,7 +266,21 @@ class Diagnoser(Protocol):
         ...
 
 
-def diagnoser_from_text(text: str, twin: DigitalTwin) -> Diagnoser:
+def class_from_text(text: str) -> Any:
+    """Return a class by ``module:Class``.
+
+    Raises:
+        InputError: If there is no such module or class.
+    """
+    module_name, _, class_name = text.partition(":")
+    module = _imported(module_name, text)
+    if not hasattr(module, class_name):
+        classes = [name for name, value in vars(module).items() if isinstance(value, type)]
+        raise InputError(f"{text}: {unknown_name(f'class of {module_name}', class_name, classes)}")
+    return getattr(module, class_name)
+
+
+def diagnoser_from_text(text: str, twin: DigitalTwin) -> CheckedDiagnoser:
     """Return a diagnoser of the user's own, such as ``my_methods:Guess`` in ``my_methods.py``.
 
     Modules are looked for in the current folder and where Python finds its packages. Verdicts in
@@ -279,13 +293,9 @@ def diagnoser_from_text(text: str, twin: DigitalTwin) -> Diagnoser:
     Raises:
         InputError: If there is no such module or class, or it has no method `diagnose`.
     """
-    module_name, _, class_name = text.partition(":")
-    module = _imported(module_name, text)
-    if not hasattr(module, class_name):
-        classes = [name for name, value in vars(module).items() if isinstance(value, type)]
-        raise InputError(f"{text}: {unknown_name(f'class of {module_name}', class_name, classes)}")
+    kind = class_from_text(text)
     try:
-        diagnoser = getattr(module, class_name)(twin)
+        diagnoser = kind(twin)
     except TypeError as error:
         raise InputError(
             f"{text}: cannot be made ({error}). Expected a class whose __init__ takes the twin."
@@ -295,11 +305,11 @@ def diagnoser_from_text(text: str, twin: DigitalTwin) -> Diagnoser:
             f"{text}: has no method `diagnose`. Expected a class with diagnose(runs) that returns "
             "a Diagnosis for each run."
         )
-    return _Completed(diagnoser, text, arm_class_of(twin.robot))
+    return CheckedDiagnoser(diagnoser, text, arm_class_of(twin.robot))
 
 
 @dataclass(frozen=True)
-class _Completed:
+class CheckedDiagnoser:
     """A diagnoser of the user's own, checked and with words and truth filled in."""
 
     diagnoser: Diagnoser

@@ -196,6 +196,9 @@ def train(
     "--test", "PATH", "Real runs to test on. Default: runs of the physics engine, as a stand-in."
 )
 @opt.published_labels_option
+@opt.flag_option(
+    "--rivals", "Compare networks, classifiers, filters and Bayes on equal terms instead."
+)
 @opt.flag_option("--quick", "A small version of about two minutes.")
 @opt.flag_option("--resume", "Continue an interrupted study.")
 @opt.robot_options
@@ -203,6 +206,7 @@ def study(
     out: Path,
     test: Path | None,
     published_labels: bool,
+    rivals: bool,
     quick: bool,
     resume: bool,
     robot: opt.RobotOptions,
@@ -220,8 +224,12 @@ def study(
     if test is None:
         opt.refuse_unused("no real runs are given", "published_labels")
     model, seed = robot.model, robot.seed
-    plan = paper.quick_plan(seed) if quick else paper.StudyPlan(seed)
     paper.check_folder(out, resume)
+    if rivals:
+        check_learning()
+        _rivals(out, test, published_labels, quick, robot)
+        return
+    plan = paper.quick_plan(seed) if quick else paper.StudyPlan(seed)
     figure_class()  # better told before the work than after it
     exam = (
         paper.stand_in_test_set(plan, model)
@@ -236,3 +244,27 @@ def study(
     page = out / paper.PAGE
     write_study_page(trainings, plan, model, exam, page)
     tell(f"written to {page}")
+
+
+def _rivals(
+    out: Path, test: Path | None, published_labels: bool, quick: bool, robot: opt.RobotOptions
+) -> None:
+    """Compare the rivals and write table and page."""
+    from failuretwin.app.reports.rivals_page import rivals_table, write_rivals
+    from failuretwin.decision.learned import paper_study as paper
+    from failuretwin.decision.rivals import study as rivals
+
+    model, seed = robot.model, robot.seed
+    plan = rivals.quick_rivals(seed) if quick else rivals.RivalPlan(seed)
+    exam = (
+        paper.stand_in_test_set(paper.StudyPlan(seed, stand_in_runs=plan.stand_in_runs), model)
+        if test is None
+        else paper.given_test_set(test, model, published_labels, "measured")
+    )
+    jobs = len(rivals.rival_jobs(plan))
+    tell(f"{jobs} trainings and diagnoses, networks of {plan.iterations} iterations")
+    with progress_bar("rivals", jobs) as advance:
+        rivals.run_rivals(plan, model, exam, out, advance)
+    scores = list(rivals.rival_scores(plan, out / paper.WORK))
+    show(rivals_table(scores))
+    tell(f"written to {write_rivals(scores, plan, model, exam, out)}")

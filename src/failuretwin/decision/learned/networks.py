@@ -102,13 +102,17 @@ class Cnn(nn.Module):
         self.hidden = nn.Linear(2 * wide, wide)
         self.dense = nn.Linear(wide, shape.classes)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Return logits (run, class)."""
+    def seen(self, x: Tensor) -> Tensor:
+        """Return the features behind the last layer, (run, feature)."""
         x = x.permute(0, 2, 1)
         for convolution in self.convolutions:
             x = torch.relu(convolution(x))
-        seen = torch.cat([x.mean(dim=2), x.amax(dim=2)], dim=1)
-        return self.dense(self.dropout(torch.relu(self.hidden(seen))))
+        pooled = torch.cat([x.mean(dim=2), x.amax(dim=2)], dim=1)
+        return self.dropout(torch.relu(self.hidden(pooled)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return logits (run, class)."""
+        return self.dense(self.seen(x))
 
 
 class MotorWise(nn.Module):

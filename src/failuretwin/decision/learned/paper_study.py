@@ -18,7 +18,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -39,6 +39,9 @@ from failuretwin.digital_model.robot import Robot
 if TYPE_CHECKING:
     import xarray as xr
 
+    from failuretwin.data_knowledge.readers.raw_sessions import As
+
+J = TypeVar("J")
 PLAN_FILE, WORK, PAGE = "study.json", "trainings", "index.html"
 
 # Plan of the study.
@@ -117,14 +120,14 @@ def class_names(robot: Robot) -> list[str]:
     return [str(hypothesis) for hypothesis in paper_hypotheses(robot.motor_names)]
 
 
-def given_test_set(path: Path, robot: Robot, published_labels: bool) -> Exam:
-    """Read a test set with linearly interpolated readings, as the authors processed theirs."""
+def given_test_set(path: Path, robot: Robot, published_labels: bool, how: As = "published") -> Exam:
+    """Read a test set; `published`: interpolated readings, as the authors processed theirs."""
     if published_labels and path.suffix in SUFFIXES:
         raise InputError(
             f"{path}: is a run set, which has its labels already; --published-labels is for raw "
             "sessions. Leave it out, or `failuretwin import` the sessions with it."
         )
-    runs = read_runs(path, robot, ReadOptions("published", published_labels))
+    runs = read_runs(path, robot, ReadOptions(how, published_labels))
     check_motors(runs, robot.name, robot.motor_names)
     truth = {known.fault for known in Truths.of(runs, str(path)).by_run.values()}
     strange = sorted(truth - set(class_names(robot)))
@@ -192,14 +195,15 @@ def run_all(
     missing = [job for job in jobs if not _file(folder, job).is_file()]
     on_progress(len(jobs) - len(missing))
     if missing:
-        _spread(partial(train, plan, folder, classes), missing, on_progress)
+        spread(partial(train, plan, folder, classes), missing, on_progress)
     files = [_file(folder, job) for job in jobs]
     return [from_table(Training, json.loads(f.read_text(encoding="utf-8")), str(f)) for f in files]
 
 
-def _spread(
-    work: Callable[[Job], None], jobs: Sequence[Job], on_progress: Callable[[int], None]
+def spread(
+    work: Callable[[J], None], jobs: Sequence[J], on_progress: Callable[[int], None]
 ) -> None:
+    """Run jobs in processes of their own, one per core at a time."""
     import torch
 
     at_a_time = 1 if torch.cuda.is_available() else min(len(jobs), os.cpu_count() or 1)
@@ -347,27 +351,39 @@ def run_study(
     plan: StudyPlan, robot: Robot, test: Exam, folder: Path, on_progress: Callable[[int], None]
 ) -> list[Training]:
     """Run what is missing of a study in a folder that `check_folder` accepted."""
+    begin(plan, robot, test, folder, make_arrays)
+    return run_all(plan, folder / WORK, len(class_names(robot)), on_progress)
+
+
+P = TypeVar("P", bound=Any)
+"""A plan: a dataclass of plain values."""
+
+
+def begin(
+    plan: P,
+    robot: Robot,
+    test: Exam,
+    folder: Path,
+    make: Callable[[P, Robot, Exam, Path], None],
+) -> None:
+    """Make the data of a study, or check that the one begun in `folder` is the same."""
     manifest = _manifest(plan, robot, test)
     stored = folder / PLAN_FILE
     if stored.is_file():
         _check_same(json.loads(stored.read_text(encoding="utf-8")), manifest, folder)
-    else:
-        try:
-            (folder / WORK).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot be made ({reason(error)}).") from error
-        make_arrays(plan, robot, test, folder / WORK)
-        write_text(json.dumps(manifest, indent=1), stored)
-    return run_all(plan, folder / WORK, len(class_names(robot)), on_progress)
+        return
+    try:
+        (folder / WORK).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be made ({reason(error)}).") from error
+    make(plan, robot, test, folder / WORK)
+    write_text(json.dumps(manifest, indent=1), stored)
 
 
-def _manifest(plan: StudyPlan, robot: Robot, test: Exam) -> dict[str, Any]:
+def _manifest(plan: Any, robot: Robot, test: Exam) -> dict[str, Any]:
     """Return everything that determines the figures of the study."""
     return {
-        "seed": plan.seed,
-        "runs_per_class": plan.runs_per_class,
-        "checkpoints": list(plan.checkpoints),
-        "repeats": plan.repeats,
+        **json.loads(json.dumps(asdict(plan))),
         "robot": fingerprint(robot),
         "test": test.source,
         "test_sha256": _digest(test),

@@ -1,0 +1,1 @@
+"""The benchmark: data sets with checksums, tasks, tracks, entries and their scores."""

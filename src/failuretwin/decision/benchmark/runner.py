@@ -1,0 +1,301 @@
+"""Running an entry through the cases, and its file of results.
+
+Answers to each case lie in a file of their own, so an interrupted run goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from failuretwin import __version__
+from failuretwin.core.config import from_table
+from failuretwin.core.errors import InputError
+from failuretwin.core.foreign import read_text, reading
+from failuretwin.core.runs import concatenate
+from failuretwin.data_knowledge.readers.raw_sessions import find_sessions
+from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
+from failuretwin.data_knowledge.store import write_text
+from failuretwin.decision.benchmark import simulated
+from failuretwin.decision.benchmark.entries import NotEnteredError, entry_of, named_runs
+from failuretwin.decision.benchmark.real import folder_of, sha256
+from failuretwin.decision.benchmark.tasks import CASES, REAL, TASKS, Case, Judgement, Score
+from failuretwin.decision.evaluation import Truths
+from failuretwin.decision.results import read_results, write_json_lines
+from failuretwin.digital_model.robot import load_robot
+from failuretwin.digital_model.twin import DigitalTwin
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+RESULTS, ANSWERS = "results.json", "answers"
+DIGITS = 4
+"""Decimals of all scores: the same on every machine."""
+REAL_ARM = "armpi_fpv"
+HEALTHY_LABELS = tuple(f"label_{label}" for label in range(5))
+"""Sessions that a healthy robot recorded; stuck motors were made afterwards."""
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Runs that an entry learns from, and runs that it then answers.
+
+    Attributes:
+        known: Runs to learn from; without `fault`: of unknown state.
+        test: Test runs with their truth.
+    """
+
+    known: tuple[xr.Dataset, ...]
+    test: xr.Dataset
+
+
+@dataclass(frozen=True)
+class Work:
+    """One case of one arm."""
+
+    arm: str
+    case: str
+    data: Path
+
+    @property
+    def name(self) -> str:
+        """Name of the file of answers, without suffix."""
+        return f"{self.arm}-{self.case}"
+
+    @property
+    def plan(self) -> Case:
+        """The case."""
+        return CASES[self.case]
+
+    @cached_property
+    def folds(self) -> list[Fold]:
+        """Parts of the case; an entry is made anew for each."""
+        if self.plan.test == REAL:
+            return list(self._sessions())
+        test = simulated.load_set(self.arm, self.plan.test, self.data)
+        if self.plan.until_s is not None:
+            test = _until(test, self.plan.until_s)
+        if self.plan.track == "P1":
+            return [Fold((self._public(test),), test)]
+        known = [simulated.load_set(self.arm, name, self.data) for name in self.plan.known]
+        same = len({runs.attrs["individual"] for runs in known}) == 1
+        together = (concatenate(known).assign_attrs(known[0].attrs),) if known and same else ()
+        return [Fold(together, test)]
+
+    def _sessions(self) -> Iterator[Fold]:
+        robot, folder = load_robot(self.arm), folder_of(REAL, self.data)
+        sessions = find_sessions(folder)
+        options = ReadOptions(published_labels=True)
+        if self.plan.track != "P0c":
+            test = read_runs(folder, robot, options).assign_attrs(individual="real")
+            yield Fold((self._public(test),) if self.plan.track == "P1" else (), test)
+            return
+        healthy = [session for session in sessions if session.name.endswith(HEALTHY_LABELS)]
+        for session in sessions:
+            known = read_runs([other for other in healthy if other != session], robot)
+            truth = ["healthy"] * known.sizes["run"]
+            known = known.assign(fault=("run", truth)).assign_attrs(individual="real")
+            test = read_runs(session, robot, options).assign_attrs(individual="real")
+            yield Fold((known,), test)
+
+    def _public(self, runs: xr.Dataset) -> xr.Dataset:
+        """Return what an entry may see of test runs."""
+        seen = runs[["command", "measured", "duration"]]
+        names = [str(h) for h in simulated.classes_of(self.arm)]
+        return named_runs(seen, [*names, "unknown"] if self.plan.unknown else names)
+
+    def answer(self, method: str, path: Path) -> bool:
+        """Write an entry's answers; return whether it takes part in the case."""
+        twin, found = DigitalTwin(load_robot(self.arm)), []
+        train = partial(simulated.load_set, self.arm, "train", self.data)
+        for fold in self.folds:
+            entry = entry_of(method, twin, train)
+            try:
+                for runs in fold.known:
+                    entry.fit(runs)
+            except NotEnteredError:
+                return False
+            found += entry.diagnose(self._public(fold.test))
+        write_json_lines(found, path)
+        return True
+
+    @property
+    def truths(self) -> Truths:
+        """The truth of all test runs."""
+        each = [Truths.of(fold.test, self.case).by_run for fold in self.folds]
+        return Truths(self.case, {run: truth for part in each for run, truth in part.items()})
+
+
+def _until(runs: xr.Dataset, end_s: float) -> xr.Dataset:
+    """Return the beginning of runs."""
+    seen = runs.isel(time=runs["time"].values < end_s)
+    duration = runs["duration"].clip(max=float(seen["time"].values[-1]))
+    return seen.assign(duration=duration)
+
+
+def wanted_work(
+    tasks: Sequence[str], arms: Sequence[str], tracks: Sequence[str], data: Path
+) -> list[Work]:
+    """Return the cases of tasks, arms and tracks; recorded runs are of one arm."""
+    names = dict.fromkeys(
+        name
+        for task in tasks
+        for case in TASKS[task].cases
+        if CASES[case].track in tracks
+        for name in (case, *TASKS[task].parts)
+    )
+    return [
+        Work(arm, name, data)
+        for arm in arms
+        for name in names
+        if CASES[name].test != REAL or arm == REAL_ARM
+    ]
+
+
+def run_entry(
+    method: str, work: Sequence[Work], out: Path, on_progress: Callable[[int], None]
+) -> dict[str, Any]:
+    """Answer the cases that have no answers yet in `out`; return and write the results.
+
+    Raises:
+        InputError: If `out` holds the results of another entry or of other data.
+    """
+    results = _begun(method, out)
+    for one in work:
+        path = out / ANSWERS / f"{one.name}.jsonl"
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            start = time.perf_counter()
+            if one.answer(method, path):
+                results["seconds"][one.name] = round(time.perf_counter() - start, 2)
+                _write(results, out)
+        on_progress(1)
+    results["scores"] = list(_scored(work, out))
+    results["answers"] = {
+        path.name: sha256(path.read_bytes()) for path in sorted((out / ANSWERS).glob("*.jsonl"))
+    }
+    _write(results, out)
+    return results
+
+
+def _begun(method: str, out: Path) -> dict[str, Any]:
+    header = {"benchmark": simulated.VERSION, "method": method}
+    path = out / RESULTS
+    if not path.exists():
+        new = {**header, "failuretwin_version": __version__}
+        return {**new, "seconds": {}, "scores": [], "answers": {}}
+    stored = read_submission(path)
+    if {key: stored[key] for key in header} != header:
+        raise InputError(
+            f"{path}: holds results of {stored['method']!r} on benchmark {stored['benchmark']}. "
+            "Choose another --out."
+        )
+    return stored
+
+
+def _write(results: Mapping[str, Any], out: Path) -> None:
+    write_text(json.dumps(results, indent=1), out / RESULTS)
+
+
+def _scored(work: Sequence[Work], out: Path) -> Iterator[dict[str, Any]]:
+    """Yield every score of the cases that were answered."""
+    for one in work:
+        for key, task in TASKS.items():
+            files = [out / ANSWERS / f"{one.arm}-{n}.jsonl" for n in (one.case, *task.parts)]
+            if one.case not in task.cases or not all(path.exists() for path in files):
+                continue
+            answers = read_results(files[0]).diagnoses
+            parts = {
+                part: read_results(path).diagnoses
+                for part, path in zip(task.parts, files[1:], strict=True)
+            }
+            for score in task.score(Judgement(answers, one.truths, parts)):
+                where = {"task": key, "arm": one.arm, "case": one.case, "track": one.plan.track}
+                yield where | _rounded(score)
+
+
+def _rounded(score: Score) -> dict[str, Any]:
+    table = asdict(score)
+    for name in ("value", "low", "high"):
+        number = float(table[name])
+        table[name] = None if not math.isfinite(number) else round(number, DIGITS)
+        if number == math.inf:
+            table[name] = "inf"
+    return table
+
+
+# Files of results, also of other people.
+
+
+@dataclass(frozen=True)
+class StoredScore:
+    """One score of a file."""
+
+    task: str
+    arm: str
+    case: str
+    track: str
+    metric: str
+    runs: int
+    value: float | str | None = None
+    low: float | str | None = None
+    high: float | str | None = None
+
+
+KEYS = ("benchmark", "method", "failuretwin_version", "seconds", "scores", "answers")
+
+
+def read_submission(path: Path) -> dict[str, Any]:
+    """Return a file of results.
+
+    Raises:
+        InputError: If it is none, or of another version of the benchmark.
+    """
+    expected = "Expected a file that `failuretwin benchmark run` or `submit-file` wrote."
+    with reading(path, "results of the benchmark", expected):
+        stored = json.loads(read_text(path, "results of the benchmark"))
+        missing = [key for key in KEYS if key not in stored]
+        if missing:
+            raise InputError(f"{path}: lacks {', '.join(missing)}. {expected}")
+        for place, score in enumerate(stored["scores"]):
+            known = {key: value for key, value in score.items() if value is not None}
+            from_table(StoredScore, known, f"{path}: score {place}")
+    if stored["benchmark"] != simulated.VERSION:
+        raise InputError(
+            f"{path}: is of benchmark {stored['benchmark']}, expected {simulated.VERSION}. Run the "
+            "entry again."
+        )
+    return dict(stored)
+
+
+def pack(out: Path, name: str, data: Path, path: Path) -> int:
+    """Write one file with the results in `out`, scored again, and all answers.
+
+    Returns the number of scores.
+
+    Raises:
+        InputError: If answers were changed after the run.
+    """
+    results = read_submission(out / RESULTS)
+    answers = {}
+    for file, expected in results["answers"].items():
+        text = read_text(out / ANSWERS / file, "answers")
+        if sha256(text.encode()) != expected:
+            raise InputError(
+                f"{out / ANSWERS / file}: was changed after the run. Remove it and run the entry "
+                "again."
+            )
+        answers[file] = text
+    work = []
+    for file in answers:
+        arm, _, case = file.removesuffix(".jsonl").partition("-")
+        work.append(Work(arm, case, data))
+    results["scores"] = list(_scored(work, out))
+    write_text(json.dumps({**results, "name": name, "texts": answers}, indent=1), path)
+    return len(results["scores"])

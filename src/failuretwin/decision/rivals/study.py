@@ -1,0 +1,412 @@
+"""The study of rivals: every method on the same training runs, the same test runs, five seeds.
+
+Each job writes its diagnoses to a file of its own, so an interrupted study goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.special import log_softmax, softmax
+
+from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.data_knowledge.store import load_run_set, replacing, save_run_set, write_text
+from failuretwin.decision.learned.feature_encoder import (
+    FeatureEncoder,
+    Floats,
+    expectation_of,
+    signals_of,
+)
+from failuretwin.decision.learned.paper_study import (
+    BATCH_RUNS,
+    REPRODUCING_RATE,
+    VALIDATION_SHARE,
+    WORK,
+    Exam,
+    begin,
+    class_names,
+    spread,
+)
+from failuretwin.decision.results import read_results, write_json_lines
+from failuretwin.digital_model.arm_classes import generic_imperfections
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
+from failuretwin.digital_model.robot import Robot, load_robot
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from failuretwin.decision.learned.networks import Batch
+
+PUBLISHED, IMPERFECT = TWINS = ("published", "imperfect")
+NETWORKS = ("lstm", "cnn", "tcn", "transformer", "motorwise")
+ADAPTING = {"dann": "P1", "fine-tuned": "P2"}
+"""CNNs that learn from target runs, with the protocol letter."""
+CLASSICAL = {
+    "minirocket": "MiniRocket",
+    "boosting": "GradientBoosting",
+    "nearest": "NearestSimulation",
+}
+MODELS = ("kalman", "bayes", "self-calibrating", "hybrid")
+"""Methods without training, and the hybrid, which pools one of them with the CNN of its seed."""
+FOLDS = 5
+FINE_TUNING = (1e-4, 0.1)
+"""Learning rate, and iterations as a share of those of the training."""
+ANSWERS, TEST = "answers", "test.nc"
+
+
+@dataclass(frozen=True)
+class RivalPlan:
+    """Sizes of the study.
+
+    Attributes:
+        seed: Random seed.
+        runs_per_class: Simulated training runs of each class, for every method.
+        iterations: Batches of 32 runs, for every network.
+        repeats: Seeds.
+        stand_in_runs: Runs per class of the stand-in test set by the physics engine.
+    """
+
+    seed: int = 0
+    runs_per_class: int = 400
+    iterations: int = 5050
+    repeats: int = 5
+    stand_in_runs: int = 40
+
+
+def quick_rivals(seed: int) -> RivalPlan:
+    """Return a small study."""
+    return RivalPlan(seed, 40, 60, 1, 4)
+
+
+@dataclass(frozen=True)
+class RivalJob:
+    """One method, trained on runs of one twin with one seed."""
+
+    method: str
+    twin: str
+    repeat: int
+
+    @property
+    def name(self) -> str:
+        """Name of its file, without suffix."""
+        return f"{self.method}_{self.twin}_{self.repeat}"
+
+    @property
+    def protocol(self) -> str:
+        """Protocol letter; the imperfect twin was calibrated on healthy logs."""
+        if self.method == "self-calibrating":
+            return "P1"
+        return ADAPTING.get(self.method, "P0" if self.twin == PUBLISHED else "P0c")
+
+
+def rival_jobs(plan: RivalPlan) -> list[RivalJob]:
+    """Return all jobs; methods without chance have one, and those of one twin only that."""
+    jobs = []
+    for repeat in range(plan.repeats):
+        for twin in TWINS:
+            names = [*NETWORKS, *ADAPTING, *CLASSICAL, "hybrid"]
+            names += [m for m in MODELS if m != "hybrid" and repeat == 0]
+            one_twin = {"motorwise": IMPERFECT, "hybrid": IMPERFECT, "self-calibrating": PUBLISHED}
+            jobs += [RivalJob(n, twin, repeat) for n in names if one_twin.get(n, twin) == twin]
+    return jobs
+
+
+def known_robot(robot: Robot, twin: str) -> CalibratedRobot:
+    """Return the robot with what a method knows of it; the published twin knows its class."""
+    if twin == PUBLISHED:
+        return CalibratedRobot(robot, generic_imperfections(robot))
+    return load_calibration(None, robot)
+
+
+# Training runs and features, made once.
+
+
+def make_rival_data(plan: RivalPlan, robot: Robot, exam: Exam, folder: Path) -> None:
+    """Write the arrays of both twins and the test runs into `folder`."""
+    from failuretwin.decision.training import WIDER, TrainingData, widened
+
+    names = class_names(robot)
+    published = simulate(Plan(robot, names, plan.runs_per_class, plan.seed))
+    encoder = FeatureEncoder("augmented", robot)
+    truth = np.array([names.index(str(fault)) for fault in published["fault"].values])
+    made = {PUBLISHED: (encoder, encoder.encode(signals_of(published)), truth)}
+    known = known_robot(robot, IMPERFECT)
+    data = TrainingData(robot, widened(known.imperfections, WIDER), plan.seed)
+    robust = FeatureEncoder("robust", robot, expectation_of(robot, known.imperfections))
+    made[IMPERFECT] = (robust, *data.chunk(0, len(published["run"]), robust))
+    for twin, (coder, features, classes) in made.items():
+        with replacing(folder / f"{twin}.npz") as new, new.open("wb") as file:
+            test = coder.encode(signals_of(exam.runs))
+            np.savez(file, allow_pickle=False, features=features, classes=classes, test=test)
+    save_run_set(exam.runs, folder / TEST)
+
+
+# One job.
+
+Answer = Callable[[], FloatArray]
+"""Returns the logits or the probabilities of the test runs, (run, class)."""
+
+
+def run_rivals(
+    plan: RivalPlan, robot: Robot, exam: Exam, out: Path, on_progress: Callable[[int], None]
+) -> None:
+    """Run the jobs without a result; hybrids come last: they pool the answers of others."""
+    begin(plan, robot, exam, out, make_rival_data)
+    jobs, folder = rival_jobs(plan), out / WORK
+    missing = [job for job in jobs if not (folder / ANSWERS / f"{job.name}.json").is_file()]
+    (folder / ANSWERS).mkdir(exist_ok=True)
+    on_progress(len(jobs) - len(missing))
+    work = partial(run_job, plan, str(robot.source), folder)
+    for late in (False, True):
+        some = [job for job in missing if (job.method == "hybrid") == late]
+        if some:
+            spread(work, some, on_progress)
+
+
+def run_job(plan: RivalPlan, profile: str, folder: Path, job: RivalJob) -> None:
+    """Write the diagnoses of one job, then its cost."""
+    robot, test = load_robot(profile), load_run_set(folder / TEST)
+    start = time.perf_counter()
+    answer: Answer = partial(_by_model, robot, folder, job, test)
+    if job.method not in MODELS:
+        answer = _by_training(plan, robot, folder, job, test)
+    trained = time.perf_counter()
+    chances = answer()
+    seconds = time.perf_counter() - trained
+    truth, names = test["fault"].values, class_names(robot)
+    found = [
+        Diagnosis(
+            str(run),
+            dict(zip(names, map(float, row), strict=True)),
+            truth=str(fault),
+            protocol=job.protocol,
+            method=f"{job.method}, {job.twin} twin",
+        )
+        for run, row, fault in zip(test["run"].values, chances, truth, strict=True)
+    ]
+    path = folder / ANSWERS / job.name
+    write_json_lines(found, path.with_suffix(".jsonl"))
+    cost = {"training_s": trained - start, "run_ms": 1e3 * seconds / len(found)}
+    write_text(json.dumps(cost), path.with_suffix(".json"))
+
+
+def _by_model(robot: Robot, folder: Path, job: RivalJob, test: xr.Dataset) -> FloatArray:
+    """Return the probabilities of a method that is not trained, (run, class)."""
+    from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
+    from failuretwin.decision.benchmark.baselines import KalmanBank
+    from failuretwin.decision.learned.log_pool import PoolWeights, log_pool
+    from failuretwin.inference.diagnoser import BayesDiagnoser
+
+    names, known = class_names(robot), known_robot(robot, job.twin)
+    if job.method == "hybrid":
+        parts = (f"bayes_{job.twin}_0", f"cnn_{job.twin}_{job.repeat}")
+        stored = [read_results(folder / ANSWERS / f"{part}.jsonl").diagnoses for part in parts]
+        bayes, network = (np.array([[d.posterior[n] for n in names] for d in ds]) for ds in stored)
+        return log_pool(bayes, network, PoolWeights(*HYBRID_WEIGHTS))
+    if job.method == "kalman":
+        bank = KalmanBank(known.twin)
+        if job.twin == IMPERFECT:
+            bank.known[""] = known.imperfections
+        found = bank.diagnose(test.assign_attrs(hypotheses=",".join(names), individual=""))
+    elif job.method == "self-calibrating":
+        found = SelfCalibratingDiagnoser(robot).diagnose(test)
+    else:
+        found = BayesDiagnoser(known.twin, known.imperfections).diagnose(test)
+    return np.array([[d.posterior[name] for name in names] for d in found])
+
+
+HYBRID_WEIGHTS = (0.8, 0.2)
+"""Weights of Bayes and the network in the pool; stated before any test set was scored."""
+
+
+def _by_training(
+    plan: RivalPlan, robot: Robot, folder: Path, job: RivalJob, test: xr.Dataset
+) -> Answer:
+    """Train a method and return what gives its probabilities.
+
+    A tenth of the training runs sets the temperature of the probabilities.
+    """
+    from failuretwin.decision.learned.diagnoser import best_temperature
+    from failuretwin.decision.learned.networks import Standard
+
+    rng = np.random.default_rng([plan.seed, job.repeat])
+    with np.load(folder / f"{job.twin}.npz", allow_pickle=False) as stored:
+        features, classes, target = stored["features"], stored["classes"], stored["test"]
+    order = rng.permutation(len(features))
+    held = round(VALIDATION_SHARE * len(order))
+    learn, judge = order[held:], order[:held]
+    standard = Standard.of(features[learn])
+    features, target = standard(features), standard(target)
+    answer: Answer
+    if job.method in CLASSICAL:
+        from failuretwin.decision.rivals import classical
+
+        model = getattr(classical, CLASSICAL[job.method])(random_state=job.repeat)
+        model.fit(features[learn], classes[learn])
+        logits = partial(_logits, len(class_names(robot)), model)
+        held_out, answer = logits(features[judge]), partial(logits, target)
+    else:
+        truth = np.array([class_names(robot).index(str(f)) for f in test["fault"].values])
+        trainer = _Trainer(plan, robot, job, rng)
+        held_out, answer = trainer.trained(
+            (features[learn], classes[learn]), features[judge], target, truth
+        )
+    temperature = best_temperature(held_out, classes[judge])
+    return lambda: np.asarray(softmax(log_softmax(answer(), axis=1) / temperature, axis=1))
+
+
+def _logits(count: int, model: Any, features: Floats) -> FloatArray:
+    """Return log probabilities of `count` classes, (run, class)."""
+    chances = np.zeros((len(features), count))
+    chances[:, model.classes_] = model.predict_proba(features)
+    return np.asarray(np.log(np.maximum(chances, LEAST)))
+
+
+LEAST = 1e-6
+"""Least probability of a classifier before the temperature: trees and neighbours give zeros."""
+
+
+@dataclass(frozen=True)
+class _Trainer:
+    """Trains the network of one job."""
+
+    plan: RivalPlan
+    robot: Robot
+    job: RivalJob
+    rng: np.random.Generator
+
+    def trained(
+        self, learn: Batch, judge: Floats, target: Floats, truth: IntArray
+    ) -> tuple[FloatArray, Answer]:
+        """Return logits of held-out runs, and what gives those of the target runs.
+
+        `truth` of the target runs is for fine-tuning alone.
+        """
+        import torch
+
+        from failuretwin.decision.learned import networks as own
+        from failuretwin.decision.learned.diagnoser import network_shape
+        from failuretwin.decision.rivals import networks as other
+
+        kind = "robust" if self.job.twin == IMPERFECT else "augmented"
+        encoder = FeatureEncoder(kind, self.robot)
+        shape = network_shape(encoder, target.shape[2], len(class_names(self.robot)))
+        torch.manual_seed(int(self.rng.integers(2**31)))
+        batches = own.shuffled_batches(*learn, BATCH_RUNS, self.rng)
+        name = "cnn" if self.job.method in ADAPTING else self.job.method
+        network: Any = other.build(name, shape)
+        steps = self.plan.iterations, REPRODUCING_RATE
+        if self.job.method == "dann":
+            run = other.adversarial_training(network, batches, target, *steps, self.rng)
+        else:
+            run = own.training(network, batches, *steps)
+        for _ in run:
+            pass
+        answer: Answer = partial(own.scores_of, network, target)
+        if self.job.method == "fine-tuned":
+            answer = partial(self._fine_tuned, network, target, truth)
+        return own.scores_of(network, judge), answer
+
+    def _fine_tuned(self, network: Any, target: Floats, truth: IntArray) -> FloatArray:
+        """Return the logits of each fold by a network that went on learning on the others."""
+        from copy import deepcopy
+
+        from failuretwin.decision.learned import networks as own
+
+        rate, share = FINE_TUNING
+        steps = max(1, round(share * self.plan.iterations))
+        found = np.zeros((len(target), len(class_names(self.robot))))
+        fold_of = folds(truth)
+        for fold in np.unique(fold_of):
+            others, these = fold_of != fold, fold_of == fold
+            tuned = deepcopy(network)
+            batches = own.shuffled_batches(target[others], truth[others], BATCH_RUNS, self.rng)
+            for _ in own.training(tuned, batches, steps if others.any() else 0, rate):
+                pass
+            found[these] = own.scores_of(tuned, target[these])
+        return found
+
+
+def folds(truth: IntArray) -> IntArray:
+    """Return the fold of each run: of every class, consecutive runs stay together."""
+    fold = np.zeros(len(truth), dtype=np.int64)
+    for number in np.unique(truth):
+        places = np.flatnonzero(truth == number)
+        fold[places] = np.arange(len(places)) * FOLDS // len(places)
+    return fold
+
+
+# Figures of a finished study.
+
+
+@dataclass(frozen=True)
+class RivalScores:
+    """Figures of one method over its seeds.
+
+    Attributes:
+        method: The method.
+        twin: The twin that it learned from.
+        protocol: Protocol letter.
+        accuracy: Share of correct runs of each seed, (seed,).
+        interval: Wilson 95 % interval of the first seed.
+        nats: Mean log score of each seed, (seed,).
+        errors: Calibration error of each seed, (seed,).
+        gain: Nats a run saved by Bayes, with interval, on the first seed.
+        p: Exact McNemar test against Bayes, on the first seed.
+        training_s: Mean training time [s].
+        run_ms: Mean time of a diagnosis [ms].
+    """
+
+    method: str
+    twin: str
+    protocol: str
+    accuracy: tuple[float, ...]
+    interval: tuple[float, float]
+    nats: tuple[float, ...]
+    errors: tuple[float, ...]
+    gain: tuple[float, float, float]
+    p: float
+    training_s: float
+    run_ms: float
+
+
+def rival_scores(plan: RivalPlan, folder: Path) -> Iterator[RivalScores]:
+    """Yield the figures of each method; paired tests are against Bayes with the calibration."""
+    from failuretwin.decision.evaluation import compare, evaluate
+
+    kinds: dict[tuple[str, str], list[RivalJob]] = {}
+    for job in rival_jobs(plan):
+        kinds.setdefault((job.method, job.twin), []).append(job)
+    answers = folder / ANSWERS
+    bayes = answers / f"bayes_{IMPERFECT}_0.jsonl"
+    for (method, twin), jobs in kinds.items():
+        found = [evaluate(answers / f"{job.name}.jsonl") for job in jobs]
+        costs = [json.loads((answers / f"{job.name}.json").read_text("utf-8")) for job in jobs]
+        against = compare(answers / f"{jobs[0].name}.jsonl", bayes)
+        yield RivalScores(
+            method,
+            twin,
+            jobs[0].protocol,
+            tuple(one.scores.accuracy for one in found),
+            found[0].scores.interval,
+            tuple(one.scores.log_score for one in found),
+            tuple(math.nan if (c := e.calibration) is None else c.equal.error for e in found),
+            (against.gain.mean, *against.gain.interval),
+            against.split.p,
+            _mean(costs, "training_s"),
+            _mean(costs, "run_ms"),
+        )
+
+
+def _mean(costs: Sequence[dict[str, float]], key: str) -> float:
+    return float(np.mean([cost[key] for cost in costs]))
