@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right, insort
 from dataclasses import dataclass
+from functools import cached_property
 from time import time as wall_clock
 
 import numpy as np
@@ -153,10 +154,15 @@ class Ramp:
     target: FloatArray
     duration: FloatArray
 
+    @cached_property
+    def ends(self) -> FloatArray:
+        """When motors come to rest, in order, (corner,) [s]."""
+        return np.unique(self.start + self.duration)
+
     def at(self, time: float | FloatArray) -> FloatArray:
         """Return the angles at times [s] of any shape, (..., motor) [rad]."""
         since = np.asarray(time)[..., None] - self.start
-        share = np.clip(since / np.maximum(self.duration, SHORTEST_S), 0.0, 1.0)
+        share = np.minimum(np.maximum(since / np.maximum(self.duration, SHORTEST_S), 0.0), 1.0)
         return np.asarray(self.origin + share * (self.target - self.origin))
 
 
@@ -222,6 +228,6 @@ class LiveReference:
         if ramp is None or time <= known:
             return []
         self.known_until = time
-        ends = np.unique(ramp.start + ramp.duration)
-        times = [*ends[(known < ends) & (ends < time)].tolist(), time]
+        between = ramp.ends[(known < ramp.ends) & (ramp.ends < time)]
+        times = [*between.tolist(), time]
         return [(at, ramp.at(at)) for at in times]
