@@ -416,12 +416,16 @@ class Interrupted:
 
     Attributes:
         took: Times until others held all partitions, by kind [s].
+
+    Args:
+        pause_s: How long a worker is paused, if others have taken over by then [s].
     """
 
     KINDS = ("kill -9 of a worker", "SIGSTOP", "network cut", "kill -9 of the server", "upgrade")
 
-    def __init__(self) -> None:
+    def __init__(self, pause_s: float) -> None:
         self.took: dict[str, list[float]] = {kind: [] for kind in self.KINDS}
+        self._pause_s = pause_s
         self.server = Server.started()
         self._proxy = Proxy(self.server.port)
         self.workers: dict[str, subprocess.Popen[bytes]] = {}
@@ -465,9 +469,13 @@ class Interrupted:
             wait_until_held(self.url, set(self.workers))
         else:
             self._interrupt_worker(kind)
-        self.took[kind].append(time.monotonic() - begun)
+        took = time.monotonic() - begun
+        self.took[kind].append(took)
         self._proxy.cut = False
-        print(f"    {kind}: {self.took[kind][-1]:.1f} s", flush=True)
+        print(f"    {kind}: {took:.1f} s", flush=True)
+        if kind == "SIGSTOP":
+            time.sleep(max(0.0, self._pause_s - took))
+            self._paused.send_signal(signal.SIGCONT)
 
     def _interrupt_worker(self, kind: str) -> None:
         name = min(set(self.workers) - {"far"})
@@ -476,19 +484,18 @@ class Interrupted:
         victim.send_signal(signals.get(kind, usual))
         wait_until_held(self.url, set(self.workers))
         if kind == "SIGSTOP":
-            victim.send_signal(signal.SIGCONT)
-            self.workers[name] = victim
+            self.workers[name] = self._paused = victim
         else:
             victim.wait(60)
             self._start()
 
 
-def kills(count: int, length_s: float, robots: int) -> None:
+def kills(count: int, length_s: float, robots: int, pause_s: float) -> None:
     """Kill, pause and cut off; print what was lost or doubled, and times to take over."""
     seconds = lives(robots, length_s, again_and_again(length_s))
     reference = Partition(resolver(None))
     expected = decided([vars(one) for one in reference.take(envelopes(seconds))])
-    fleet, stop = Interrupted(), threading.Event()
+    fleet, stop = Interrupted(pause_s), threading.Event()
     url = fleet.url
     ask(url, lambda broker: announce(broker, robots))
     playing = threading.Thread(target=lambda: ask(url, lambda b: play(b, seconds, 1.0, stop)))
@@ -530,6 +537,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=700.0)
+    parser.add_argument("--pause", type=float, default=0.0)
     told = parser.parse_args()
     if told.part == "filter":
         filter_alone(told.robots)
@@ -538,7 +546,7 @@ def main() -> None:
     elif told.part == "transport":
         transport(told.robots)
     else:
-        kills(told.kills, told.seconds, told.robots[0])
+        kills(told.kills, told.seconds, told.robots[0], told.pause)
 
 
 if __name__ == "__main__":

@@ -34,8 +34,8 @@ from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.nonidealities import Imperfections, vary
 from failuretwin.inference.diagnoser import BayesDiagnoser
 
-WEEK_H, WEEKS, SEASON = 168.0, 52, 13
-"""Hours of a week, weeks of a year, and weeks for which wear and temperature count as constant."""
+WEEKS, SEASON = 52, 13
+"""Weeks of a year, and weeks for which wear and temperature count as constant."""
 LIFE_H, SHAPE = 30_000.0, 2.0
 """Scale [h] and shape of the Weibull law of a motor without payload at 20 degrees."""
 MODES = ("stuck", "steady_state_error")
