@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from nicegui import context, events, ui
+from nicegui import events, ui
 
 from failuretwin.app.console import texts
 from failuretwin.app.console.checking import CheckRun, beat_watch
@@ -50,62 +50,70 @@ REPORTS = 20
 
 def show_check(visit: Visit, name: str) -> None:
     """Draw the page of checks."""
-    desk = visit.desk
-    live = desk.live.get(name)
-    place = live.settings.place if live is not None else ""
-    known = (desk.robot(name) if name else None) or desk.known
-    real = bool(place) and desk.move
     with page(visit, texts.CHECK):
+        CheckPage(visit, name)
+
+
+class CheckPage:
+    """Starts a check of a robot, shows what happens, and stops it."""
+
+    def __init__(self, visit: Visit, name: str) -> None:
+        desk = visit.desk
+        live = desk.live.get(name)
+        place = live.settings.place if live is not None else ""
+        self._visit, self._name = visit, name
+        self._known = (desk.robot(name) if name else None) or desk.known
+        self._real = bool(place) and desk.move
         if name:
             ui.link(name, link_to("robot", name=name))
-        where = texts.REAL_ARM.format(place=place) if real else texts.EMULATED_ARM
+        where = texts.REAL_ARM.format(place=place) if self._real else texts.EMULATED_ARM
         text(texts.CHECK_NOTE.format(place=where))
         if place and not desk.move:
             text(texts.NO_MOVE)
-        seconds = ui.number(texts.SECONDS, value=20, min=5, max=LONGEST_CHECK_S).classes("w-32")
-
-        def start() -> None:
-            if not visit.allows(MOVE):
-                return
-            if desk.check is not None and desk.check.running:
-                ui.notify(texts.BUSY, type="negative")
-                return
-            page_open = context.client
-            checking = Checking(known, SafetyGate(known.robot))
-            desk.check = CheckRun(
-                name or known.robot.name,
-                checking,
-                lambda stack: _arm(desk, known, name, real, stack),
-                beat_watch(lambda: desk.beat_s, lambda: page_open.has_socket_connection),
-                lambda result: _keep(desk, known, name, result),
-            )
-            desk.check.start(min(max(float(seconds.value or 20.0), 5.0), LONGEST_CHECK_S))
-
+        self._seconds = ui.number(texts.SECONDS, value=20, min=5, max=LONGEST_CHECK_S)
         with ui.row().classes("gap-4 items-center"):
             if visit.session.may(MOVE):
-                button(texts.START, start)
+                button(texts.START, self._start)
             # A form: it works without scripts, so also when the page hangs.
             with ui.element("form").props('method="post" action="/stop" target="stop"'):
                 stop = text(texts.STOP, "button").props('type="submit"')
                 stop.classes("state state-alarm text-lg font-bold px-6 py-2")
         text(texts.STOP_NOTE).classes("soft")
         ui.element("iframe").props(f'name="stop" title="{texts.STOP}"').classes("hidden")
-        lines = ui.element("div").props('role="log" aria-live="polite"')
-        shown: list[object] = []
+        self._lines = ui.element("div").props('role="log" aria-live="polite"')
+        self._shown: list[object] = []
+        ui.timer(LINES_S, self._update)
 
-        def update() -> None:
-            check = desk.check
-            now = [] if check is None else [*check.lines, check.result]
-            if check is not None and now != shown:
-                shown[:] = now
-                lines.clear()
-                with lines:
-                    for line in check.lines:
-                        text(line)
-                    if check.result is not None:
-                        _result(check.result, known)
+    def _start(self) -> None:
+        desk, known, name = self._visit.desk, self._known, self._name
+        if not self._visit.allows(MOVE):
+            return
+        if desk.check is not None and desk.check.running:
+            ui.notify(texts.BUSY, type="negative")
+            return
+        client = ui.context.client
+        desk.check = CheckRun(
+            name or known.robot.name,
+            Checking(known, SafetyGate(known.robot)),
+            lambda stack: _arm(desk, known, name, self._real, stack),
+            beat_watch(lambda: desk.beat_s, lambda: client.has_socket_connection),
+            lambda result: _keep(desk, known, name, result),
+        )
+        seconds = float(self._seconds.value or 20.0)
+        desk.check.start(min(max(seconds, 5.0), LONGEST_CHECK_S))
 
-        ui.timer(LINES_S, update)
+    def _update(self) -> None:
+        check = self._visit.desk.check
+        now = [] if check is None else [*check.lines, check.result]
+        if check is None or now == self._shown:
+            return
+        self._shown = now
+        self._lines.clear()
+        with self._lines:
+            for line in check.lines:
+                text(line)
+            if check.result is not None:
+                _result(check.result, self._known)
 
 
 def _arm(desk: Desk, known: CalibratedRobot, name: str, real: bool, stack: ExitStack) -> Commander:

@@ -10,10 +10,11 @@ from math import cos, sin
 
 import numpy as np
 from nicegui import ui
+from nicegui.elements.scene.scene_object3d import Object3D
 
 from failuretwin.app.console.state import SUSPECT
 from failuretwin.core.hypothesis import SURE
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 
 THICK = 0.03
@@ -35,8 +36,8 @@ class Arm:
     def __init__(self, robot: Robot, scene: ui.scene, solid: bool) -> None:
         self._robot = robot
         self._slides = robot.slides
-        self._joints: list[ui.scene.group] = []
-        self._motors: list[ui.scene.sphere] = []
+        self._joints: list[Object3D] = []
+        self._motors: list[Object3D] = []
         self._shade = [""] * len(robot.motors)
         transforms, _ = robot.chain.constants
         radius = THICK * robot.reach * (1.0 if solid else 0.8)
@@ -122,7 +123,7 @@ class ArmScene:
         self._ghost = Arm(robot, self._scene, solid=False)
         with self._scene:
             self._points = ui.scene.point_cloud([], point_size=0.012 * reach / 0.3)
-        near = 1.25 * reach
+        near = 0.85 * reach
         self._scene.move_camera(near, -near, 0.9 * near, 0.0, 0.0, 0.35 * reach, duration=0.0)
 
     def show(self, pose: FloatArray, command: FloatArray, shares: Mapping[str, float]) -> None:
@@ -131,7 +132,7 @@ class ArmScene:
         self._ghost.pose(command)
         self._solid.colour(shares)
 
-    def points(self, points: FloatArray, reached: FloatArray) -> None:
+    def points(self, points: FloatArray, reached: BoolArray) -> None:
         """Draw points (point, 3) [m] in green where they can be reached, else in red."""
         colours = [REACHED if one else MISSED for one in reached.tolist()]
         self._points.set_points(points.tolist(), colours)

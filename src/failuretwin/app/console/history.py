@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 
 from nicegui import ui
 
 from failuretwin.app.console import texts
 from failuretwin.app.console.guard import CONFIRM
 from failuretwin.app.console.layout import (
+    Cell,
     Visit,
     button,
     heading,
@@ -102,7 +104,7 @@ class HistoryPage:
     def _episodes(self, history: History) -> None:
         heading(texts.EPISODES)
         time = self._visit.time
-        rows = []
+        rows: list[list[Cell]] = []
         for one in reversed(history.episodes):
             found = one.finding
             said = (
@@ -125,21 +127,21 @@ class HistoryPage:
         table(heads if self._visit.confirms else heads[:-1], rows)
 
     def _buttons(self, episode: FaultEpisode) -> Callable[[], object]:
+        judging = {texts.CONFIRM: CONFIRMED, texts.REJECT: WRONG, texts.OTHER: OTHER_CAUSE}
+
         def draw() -> None:
             if not self._visit.confirms:
                 return
-            for words, verdict in (
-                (texts.CONFIRM, CONFIRMED),
-                (texts.REJECT, WRONG),
-                (texts.OTHER, OTHER_CAUSE),
-            ):
-                work = lambda verdict=verdict: self._found(episode, verdict)  # noqa: E731
-                _labelled(words, episode, lambda work=work: self._state(work))
+            for words, verdict in judging.items():
+                self._button(words, episode, partial(self._found, episode, verdict))
             if episode.finding is not None:
-                work = lambda: self._withdraw(episode)  # noqa: E731
-                _labelled(texts.UNDO, episode, lambda: self._state(work))
+                self._button(texts.UNDO, episode, partial(self._withdraw, episode))
 
         return draw
+
+    def _button(self, words: str, episode: FaultEpisode, work: Callable[[], object]) -> None:
+        made = button(words, lambda: self._state(work)).props("outline")
+        made.props(f'aria-label="{words}: {texts.EPISODE.lower()} {episode.number}"')
 
     def _repair(self) -> None:
         known = self._visit.desk.robot(self._name)
@@ -160,7 +162,8 @@ class HistoryPage:
             button(texts.REPAIR, lambda: self._state(work))
 
             def undo() -> None:
-                self._store.withdraw_repair(self._name, person=_value(self._person))
+                person = _value(self._person)
+                self._store.withdraw_repair(self._name, str(motor.value), person=person)
 
             button(texts.UNDO_REPAIR, lambda: self._state(undo))
 
@@ -175,11 +178,6 @@ class HistoryPage:
         text(learned.line)
         rows = [[one.name, str(one.confirmed), f"{one.factor:.2f}"] for one in learned.rates]
         table(texts.RATE_COLUMNS, rows)
-
-
-def _labelled(words: str, episode: FaultEpisode, press: Callable[[], object]) -> None:
-    made = button(words, press).props("outline")
-    made.props(f'aria-label="{words}: {texts.EPISODE.lower()} {episode.number}"')
 
 
 def _field(label: str, value: str = "") -> ui.input:

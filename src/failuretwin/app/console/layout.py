@@ -206,7 +206,11 @@ def state_badge(state: str) -> ui.label:
     return text(words, "span").classes(f"state state-{state}")
 
 
-def table(headings: Sequence[str], rows: Sequence[Sequence[str | Callable[[], object]]]) -> None:
+Cell = str | Callable[[], object]
+"""Cell of a table: text, or what draws it."""
+
+
+def table(headings: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
     """Draw a table; cells are texts, or draw themselves."""
     with ui.element("div").classes("scroll").props('tabindex="0" role="region"') as region:
         region.props(f'aria-label="{headings[0]}"')

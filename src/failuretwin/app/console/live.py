@@ -88,7 +88,7 @@ class LiveRobot(Sink):
             maxlen=round(KEPT_S / POSTERIOR_S)
         )
         self._starts: deque[float] = deque(maxlen=MOVEMENTS)
-        self._command: tuple[float, ...] = ()
+        self._begun = 0
         self._heard: datetime | None = None
         self._stopped = Event()
         motors = settings.known.robot.motor_names
@@ -125,6 +125,7 @@ class LiveRobot(Sink):
             np.array(list(self._starts)),
             self.view.diagnosis,
             posterior,
+            self._begun - len(self._starts) + 1,
         )
 
     def put(self, item: Item) -> None:
@@ -190,6 +191,7 @@ class LiveRobot(Sink):
             return None
         if np.isfinite(ramp.start) and (not self._starts or ramp.start > self._starts[-1]):
             self._starts.append(float(ramp.start))
+            self._begun += 1
         return np.asarray(ramp.at(at))
 
     def _tile(self, shadow: Shadow, word: str, message: str) -> Tile:

@@ -14,6 +14,7 @@ from failuretwin.app.console import state as shown
 from failuretwin.app.console import texts
 from failuretwin.app.console.arm import ArmScene
 from failuretwin.app.console.layout import (
+    Cell,
     Visit,
     button,
     heading,
@@ -32,6 +33,7 @@ from failuretwin.decision.acting.reach import Reach, reach, workspace
 from failuretwin.decision.robot_state import robot_state
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
+from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.explanation import percent
 
 FRAME_S, CHART_S = 0.1, 1.0
@@ -40,6 +42,8 @@ CHARTED_S = 60.0
 """Time that live charts show [s]."""
 MOST_POINTS = 600
 """Points of a chart."""
+RESIDUAL_POINTS = 100
+"""Points of the chart of residuals: each is solved for."""
 MOST_LINES = 6
 """Hypotheses of the chart of probabilities."""
 INTERESTING = 0.01
@@ -115,7 +119,9 @@ def _runs(visit: Visit, name: str) -> None:
         address = link_to("replay", name=name, run=row)
         return lambda: ui.link(texts.PLAY, address).props(f'aria-label="{texts.PLAY} {row}"')
 
-    rows = [[visit.time(one.at), one.name, one.verdict, play(one.row, one.log)] for one in runs]
+    rows: list[list[Cell]] = [
+        [visit.time(one.at), one.name, one.verdict, play(one.row, one.log)] for one in runs
+    ]
     table((texts.WHEN, texts.RUN, texts.VERDICT, texts.PLAY), rows)
 
 
@@ -190,8 +196,8 @@ def chart(label: str, unit: str) -> ui.echart:
     options = {
         "animation": False,
         "color": COLOURS,
-        "legend": {"type": "scroll", "textStyle": {"color": "#8d979f"}},
-        "grid": {"left": 55, "right": 15, "top": 35, "bottom": 30},
+        "legend": {"type": "scroll", "top": 0, "textStyle": {"color": "#7d8790"}},
+        "grid": {"left": 55, "right": 15, "top": 45, "bottom": 30},
         "xAxis": {**axis, "min": "dataMin", "max": "dataMax"},
         "yAxis": {**axis, "name": unit},
         "series": [],
@@ -242,19 +248,14 @@ def posterior_lines(trace: Trace, since_s: float) -> dict[str, tuple[FloatArray,
 
 
 def residual_lines(
-    visit: Visit, trace: Trace, known: CalibratedRobot, since_s: float
-) -> tuple[dict[str, tuple[FloatArray, FloatArray]], str]:
-    """Return the residual of each motor over time, and its unit."""
-    rows = (trace.time >= since_s) & np.isfinite(trace.measured).all(axis=1)
-    robot = known.robot
-    value = shown.residuals(known.twin, trace.command[rows], trace.measured[rows])
-    factor, unit = (1.0, "rad") if visit.unit == "rad" else (180.0 / np.pi, "deg")
-    if visit.unit == "counts" and robot.profile.servo_units is not None:
-        slope = np.diff(robot.servo_units.to_counts(np.array([0.0, 1e-3])))[0] / 1e-3
-        factor, unit = float(slope), "counts"
-    scale = np.where(robot.slides, 1e3, factor)
-    names = [f"{n} [mm]" if s else n for n, s in zip(robot.motor_names, robot.slides, strict=True)]
-    return {name: (trace.time[rows], scale[k] * value[:, k]) for k, name in enumerate(names)}, unit
+    trace: Trace, arm: InverseKinematics, since_s: float
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return what remains of the tool error with each motor, over time [mm]."""
+    rows = np.flatnonzero((trace.time >= since_s) & np.isfinite(trace.measured).all(axis=1))
+    rows = rows[:: max(1, len(rows) // RESIDUAL_POINTS)]
+    value = shown.residuals(arm, trace.command[rows], trace.measured[rows])
+    names = [*arm.robot.motor_names, texts.TOTAL]
+    return {name: (trace.time[rows], 1e3 * value[:, k]) for k, name in enumerate(names)}
 
 
 def tool_lines(
@@ -262,19 +263,19 @@ def tool_lines(
 ) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Return the tool path as commanded and as measured [mm]."""
     rows = trace.time >= since_s
-    path, time = known.twin.path(trace.command[rows]), trace.time[rows]
-    found = {}
+    seen = rows & np.isfinite(trace.measured).all(axis=1)
+    path, found = known.twin.path(trace.command[rows]), {}
     for k, axis in enumerate("xyz"):
-        found[f"{axis} {texts.MEASURED}"] = time, 1e3 * trace.measured[rows, k]
-        found[f"{axis} {texts.COMMANDED}"] = time, 1e3 * path[:, k]
+        found[f"{axis} {texts.MEASURED}"] = trace.time[seen], 1e3 * trace.measured[seen, k]
+        found[f"{axis} {texts.COMMANDED}"] = trace.time[rows], 1e3 * path[:, k]
     return found
 
 
 class Charts:
     """Residuals and tool path of a trace, and its probabilities where they are known."""
 
-    def __init__(self, visit: Visit, known: CalibratedRobot, with_posterior: bool) -> None:
-        self._visit, self._known = visit, known
+    def __init__(self, known: CalibratedRobot, with_posterior: bool) -> None:
+        self._known, self._arm = known, InverseKinematics.of(known.robot)
         self._posterior: ui.echart | None = None
         if with_posterior:
             heading(texts.POSTERIOR)
@@ -282,7 +283,7 @@ class Charts:
             self._posterior.options["yAxis"] |= {"min": 0.0, "max": 1.0}
         heading(texts.RESIDUALS)
         text(texts.RESIDUAL_NOTE).classes("soft")
-        self._residuals = chart(texts.RESIDUALS, "deg")
+        self._residuals = chart(texts.RESIDUALS, "mm")
         heading(texts.TOOL)
         self._tool = chart(texts.TOOL, "mm")
 
@@ -290,8 +291,7 @@ class Charts:
         """Draw a trace from a time on; `mark` is where a replay is [s]."""
         if not len(trace.time):
             return
-        found, unit = residual_lines(self._visit, trace, self._known, since_s)
-        self._residuals.options["yAxis"]["name"] = unit
+        found = residual_lines(trace, self._arm, since_s)
         self._residuals.options["series"] = lines_of(found, mark)
         self._tool.options["series"] = lines_of(
             tool_lines(trace, self._known, since_s), mark, texts.COMMANDED
@@ -304,20 +304,37 @@ class Charts:
 # Why: the verdict and the movements behind it.
 
 
-def why(diagnosis: Diagnosis, movements: FloatArray, go_to: Callable[[float], None]) -> None:
+def why(diagnosis: Diagnosis, trace: Trace, go_to: Callable[[float], None]) -> None:
     """Draw the reasons of a diagnosis; a click on a movement goes to its time [s]."""
     for line in diagnosis.explanation:
         text(line)
-    last = max((one.movement for one in diagnosis.evidence), default=0)
-    first = max(0, len(movements) - last) if len(movements) > last else 0
+    starts = dict(enumerate(trace.movements.tolist(), start=trace.first))
     with ui.row().classes("gap-2"):
         for one in diagnosis.evidence:
-            k = first + one.movement - 1
-            at = one.time_s if one.time_s is not None else None
-            at = float(movements[k]) if at is None and 0 <= k < len(movements) else at
-            words = texts.MOVEMENT_BUTTON.format(number=one.movement, nats=one.nats)
-            made = button(words, lambda at=at: None if at is None else go_to(at))
-            made.props("outline")
+            at = starts.get(one.movement, one.time_s)
+            if at is not None:
+                words = texts.MOVEMENT_BUTTON.format(number=one.movement, nats=one.nats)
+                button(words, lambda at=at: go_to(at)).props("outline")
+
+
+class Angles:
+    """Angles of the motors as told and as drawn, in the unit of the reader."""
+
+    def __init__(self, visit: Visit, robot: Robot) -> None:
+        self._visit, self._robot = visit, robot
+        self._cells: list[ui.label] = []
+
+        def cell() -> None:
+            self._cells.append(text("", "span"))
+
+        rows: list[list[Cell]] = [[name, cell, cell] for name in robot.motor_names]
+        table((texts.ANGLES, texts.TOLD, texts.DRAWN), rows)
+
+    def show(self, command: FloatArray, pose: FloatArray) -> None:
+        """Write the angles of two poses, (motor,) [rad]."""
+        for k, cell in enumerate(self._cells):
+            value = (command, pose)[k % 2][k // 2]
+            cell.set_text(self._visit.angle(float(value), self._robot, k // 2))
 
 
 class LivePage:
@@ -328,16 +345,18 @@ class LivePage:
         self._known = live.settings.known
         self._arm = InverseKinematics.of(self._known.robot)
         self._said: object = None
+        self._poses = (self._known.robot.resting_pose,) * 2
         with ui.element("div").classes("columns"):
             with ui.element("section"):
                 heading(texts.ARM)
                 self._scene = ArmScene(self._known.robot, texts.ARM)
                 text(texts.ARM_NOTE).classes("soft")
                 self._clock = text("").classes("soft")
+                self._angles = Angles(visit, self._known.robot)
                 ui.link(texts.REPLAY_LIVE, link_to("replay", name=live.settings.name, run=0))
             self._verdict = ui.element("section").props('aria-live="polite"')
             with ui.element("section"):
-                self._charts = Charts(visit, self._known, with_posterior=True)
+                self._charts = Charts(self._known, with_posterior=True)
             with ui.element("section"):
                 heading(texts.CHANGES)
                 self._changes = ui.element("div")
@@ -359,6 +378,7 @@ class LivePage:
         suspects = shown.suspected_motors(motors, view.diagnosis)
         pose = shown.seen_pose(self._arm, sample.command, sample.tool, suspects)
         self._scene.show(pose, sample.command, shown.motor_shares(motors, view.diagnosis))
+        self._poses = sample.command, pose
         read = datetime.fromtimestamp(sample.read, UTC)
         words = texts.READ_AT.format(time=self._visit.time(read, seconds=True))
         self._clock.set_text(words)
@@ -369,6 +389,7 @@ class LivePage:
         view, trace = self._live.view, self._live.trace()
         if len(trace.time):
             self._charts.show(trace, float(trace.time[-1]) - CHARTED_S)
+            self._angles.show(*self._poses)
         said = (view.tile.state, view.tile.said, view.diagnosis, len(view.changes))
         if said != self._said:
             self._said = said
@@ -383,7 +404,7 @@ class LivePage:
             self._say_alarm(view)
             if view.diagnosis is not None:
                 heading(texts.WHY)
-                why(view.diagnosis, trace.movements, self._go_to)
+                why(view.diagnosis, trace, self._go_to)
                 heading(texts.NEXT)
                 text(robot_state([view.diagnosis], self._known.robot).step)
             heading(texts.MOTORS)
@@ -440,9 +461,7 @@ class Replay:
     def __init__(self, visit: Visit, trace: Trace, known: CalibratedRobot, at: float) -> None:
         self._visit, self._trace, self._known = visit, trace, known
         self._arm = InverseKinematics.of(known.robot)
-        diagnosis, motors = trace.diagnosis, known.robot.motor_names
-        self._suspects = shown.suspected_motors(motors, diagnosis)
-        self._shares = shown.motor_shares(motors, diagnosis)
+        diagnosis = trace.diagnosis
         low, high = float(trace.time[0]), float(trace.time[-1])
         with ui.element("div").classes("columns"):
             with ui.element("section"):
@@ -456,12 +475,13 @@ class Replay:
                 self._slider.props(f'aria-label="{texts.SLIDER}"')
                 self._timer = ui.timer(PLAY_S, self._step, active=False)
                 self._play = button(texts.PLAY, self._toggle)
+                self._angles = Angles(visit, known.robot)
             with ui.element("section"):
                 if diagnosis is not None:
                     heading(texts.VERDICT)
                     text(diagnosis.verdict)
                     heading(texts.WHY)
-                    why(diagnosis, trace.movements, self._slider.set_value)
+                    why(diagnosis, trace, self._go_to)
                     _motor_table(known, diagnosis)
                 _asked(
                     texts.BLIND,
@@ -469,9 +489,12 @@ class Replay:
                     lambda: visit.desk.blind_spots(trace, known),
                 )
             with ui.element("section"):
-                self._charts = Charts(visit, known, with_posterior=bool(trace.posterior))
+                self._charts = Charts(known, with_posterior=bool(trace.posterior))
         self._charts_at = -np.inf
         self._move()
+
+    def _go_to(self, at: float) -> None:
+        self._slider.set_value(at)
 
     def _toggle(self) -> None:
         self._timer.active = not self._timer.active
@@ -483,14 +506,22 @@ class Replay:
         if float(self._slider.value) >= end:
             self._toggle()
 
+    def _diagnosis_at(self, at: float) -> Diagnosis | None:
+        """Return what was believed at a time [s], where it was followed; else of the whole run."""
+        before = [posterior for time, posterior in self._trace.posterior if time <= at]
+        return Diagnosis("", before[-1]) if before else self._trace.diagnosis
+
     def _move(self) -> None:
         """Draw the moment of the slider."""
         trace, at = self._trace, float(self._slider.value)
         k = int(np.clip(np.searchsorted(trace.time, at), 0, len(trace.time) - 1))
         seen = np.flatnonzero(np.isfinite(trace.measured).all(axis=1))
         near = seen[np.argmin(np.abs(trace.time[seen] - at))] if len(seen) else k
-        pose = shown.seen_pose(self._arm, trace.command[k], trace.measured[near], self._suspects)
-        self._scene.show(pose, trace.command[k], self._shares)
+        diagnosis, motors = self._diagnosis_at(at), self._known.robot.motor_names
+        suspects = shown.suspected_motors(motors, diagnosis)
+        pose = shown.seen_pose(self._arm, trace.command[k], trace.measured[near], suspects)
+        self._scene.show(pose, trace.command[k], shown.motor_shares(motors, diagnosis))
+        self._angles.show(trace.command[k], pose)
         self._clock.set_text(texts.STREAM_TIME.format(time=at))
         if abs(at - self._charts_at) >= 0.5 or not self._timer.active:
             self._charts_at = at

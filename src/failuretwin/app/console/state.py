@@ -18,7 +18,6 @@ from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.records import CHECK_DAYS
 from failuretwin.data_knowledge.records.overview import RobotGlance
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
-from failuretwin.digital_model.twin import DigitalTwin
 
 ALARM, SUSPECTED, UNDECIDED, STALE, WAITING, HEALTHY = texts.STATES
 WORST_FIRST = (ALARM, SUSPECTED, UNDECIDED, STALE, WAITING, HEALTHY)
@@ -118,9 +117,10 @@ class Trace:
         time: (sample,) [s].
         command: References of the motors, (sample, motor) [rad].
         measured: Tool positions, (sample, axis) [m]; NaN: no reading.
-        movements: Starts of the movements that evidence counts, (movement,) [s].
+        movements: Starts of movements, (movement,) [s].
         diagnosis: Diagnosis of it; None: none.
         posterior: Times [s] and probabilities of hypotheses; empty: not followed over time.
+        first: Number of the first of the movements.
     """
 
     name: str
@@ -130,6 +130,7 @@ class Trace:
     movements: FloatArray
     diagnosis: Diagnosis | None
     posterior: Sequence[tuple[float, Mapping[str, float]]] = ()
+    first: int = 1
 
 
 def worst_first(tiles: Sequence[Tile]) -> list[Tile]:
@@ -232,13 +233,14 @@ def seen_pose(
     return np.asarray(arm.solve(tool[None], command[None], locked).pose[0, 0])
 
 
-def residuals(twin: DigitalTwin, command: FloatArray, tool: FloatArray) -> FloatArray:
-    """Return for each motor the displacement that alone explains the tool best [rad].
+def residuals(arm: InverseKinematics, command: FloatArray, tool: FloatArray) -> FloatArray:
+    """Return what remains of the tool error if one motor differs from its command [m].
 
-    d_k = J_k . r / |J_k|^2 of the residual r = tool - path(command); (..., motor). A motor that
-    does not move the tool gets 0.
+    r_k = min over q_k of |tool - path(q)|, all other motors at their command; the last column is
+    the error with all of them there. Commands are (sample, motor) [rad], the result is (sample,
+    motor + 1).
     """
-    point, jacobian = twin.path_and_jacobian(command)
-    square = np.sum(jacobian**2, axis=-2)
-    along = np.einsum("...ak,...a->...k", jacobian, tool - point)
-    return np.divide(along, square, out=np.zeros_like(along), where=square > 1e-6)
+    motors = command.shape[-1]
+    alone = [arm.solve(tool, command[:, None], np.arange(motors) != k) for k in range(motors)]
+    error = np.linalg.norm(tool - arm.tool(command)[0], axis=-1)
+    return np.column_stack([*(one.miss_m[:, 0] for one in alone), error])

@@ -34,7 +34,7 @@ SIGNS = {
     "alarm": "✕",
     "suspected": "!",
     "undecided": "?",
-    "stale": "⏸",
+    "stale": "=",
     "waiting": "…",
     "healthy": "✓",
 }
@@ -64,7 +64,9 @@ MOTORS, MOTOR, STATE, PROBABILITY, SAYS = "Motors", "Motor", "State", "Fault pro
 ARM = "Arm: solid where it is, transparent where it was told to be"
 ARM_NOTE = "The solid arm is drawn from the measured tool and the suspected motor."
 POSTERIOR, RESIDUALS, TOOL = "Probability over time", "Residuals by motor", "Tool path"
-RESIDUAL_NOTE = "Displacement of each motor that alone explains the position of the tool best."
+RESIDUAL_NOTE = "What remains of the tool error if only this motor differs from its command."
+TOTAL = "tool error"
+ANGLES, TOLD, DRAWN = "Angles", "Told", "Drawn"
 COMMANDED, MEASURED = "commanded", "measured"
 BLIND, ASK_BLIND = "What the motion could not show", "Work it out"
 REACH, ASK_REACH = "What it can still reach", "Show in the scene"
@@ -87,7 +89,7 @@ EPISODES, EPISODE, FAULT, FINDING = "Fault episodes", "Episode", "Fault", "Findi
 TIMELINE, EVENT = "Timeline", "Event"
 YOUR_NAME, NOTE, CAUSE, PART = "Your name", "Note", "Cause", "Part"
 CONFIRM, REJECT, OTHER, UNDO = "Confirm", "Reject", "Other cause", "Undo"
-NOTE_REPAIR, REPAIR, UNDO_REPAIR = "Note a repair", "Repair", "Undo the last repair"
+NOTE_REPAIR, REPAIR, UNDO_REPAIR = "Note a repair", "Repair", "Undo its last repair"
 RATES = "Learned rates of faults"
 RATE_COLUMNS = ("Fault", "Confirmed", "Times the assumed rate")
 COMPARE, THEN, NOW = "Compare two dates", "Then", "Now"

@@ -32,7 +32,7 @@ export default {
       tiles: new Map(),
       search: "",
       chosen: { kind: "", site: "", mode: "", state: "" },
-      format: new Intl.DateTimeFormat(undefined, { dateStyle: "short", timeStyle: "medium" }),
+      format: new Intl.DateTimeFormat("sv-SE", { dateStyle: "short", timeStyle: "medium" }),
     };
   },
   computed: {

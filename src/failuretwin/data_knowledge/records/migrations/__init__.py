@@ -15,7 +15,7 @@ from failuretwin.core.errors import needs_extra
 if TYPE_CHECKING:
     from alembic.config import Config
 
-HEAD = "5"
+HEAD = "6"
 """Revision that this version of the package reads and writes."""
 REVISION_TABLE = "alembic_version"
 """Table in which alembic keeps the revision."""
