@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 
 import pytest
 
 from failuretwin.app.console.guard import add_user
-from fleet_servers import free_port, wait_for
+from fleet_servers import free_port
+from waiting import wait_for
 
 REQUIRE = "FAILURETWIN_REQUIRE_CHROMIUM"
 """Variable that makes tests fail where the browser is not installed."""
@@ -39,8 +41,18 @@ class ConsoleServer:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "failuretwin", "console", *options, "--users", "users.toml"],
             cwd=self._folder,
+            env={k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"},
         )
-        wait_for(self.port, self.process)
+        try:
+            wait_for(self._listens)
+        except AssertionError:
+            self.kill()
+            raise
+
+    def _listens(self):
+        assert self.process.poll() is None, "the server ended"
+        with socket.socket() as one:
+            return one.connect_ex(("127.0.0.1", self.port)) == 0
 
     def kill(self):
         self.process.kill()

@@ -17,6 +17,7 @@ from failuretwin.app.console.checking import CheckRun, beat_watch
 from failuretwin.app.console.desk import Desk, Imported
 from failuretwin.app.console.guard import LARGEST_UPLOAD, MOVE
 from failuretwin.app.console.layout import (
+    Choice,
     Visit,
     button,
     heading,
@@ -41,6 +42,9 @@ LINES_S = 0.5
 LONGEST_CHECK_S = 120.0
 SUFFIXES = (".nc", ".csv", ".mat", ".bag", ".mcap", ".db3", ".parquet")
 """Files that are taken."""
+LABELS = f"""for (const one of document.querySelectorAll(".q-uploader__input, .q-uploader a"))
+one.setAttribute("aria-label", "{texts.DROP_LABEL}")"""
+"""Names the parts of the upload for screen readers."""
 REPORTS = 20
 """Pages for technicians that are kept."""
 
@@ -166,7 +170,7 @@ def show_import(visit: Visit) -> None:
     with page(visit, texts.IMPORT):
         with ui.row().classes("gap-4 items-end"):
             kinds = sorted({own, *bundled_robots()})
-            kind = ui.select(kinds, value=own, label=texts.PROFILE).classes("w-48")
+            kind = Choice(kinds, own, texts.PROFILE)
             robot = ui.input(texts.ROBOT_NAME).props("maxlength=64").classes("w-64")
         status = ui.element("div").props('role="status"')
 
@@ -181,11 +185,11 @@ def show_import(visit: Visit) -> None:
             if isinstance(arrived, str):
                 ui.notify(arrived, type="negative", multi_line=True)
             else:
-                found = await worked(desk.diagnose, arrived.path, str(kind.value), wanted)
+                found = await worked(desk.diagnose, arrived.path, kind.value, wanted)
             status.clear()
             if found is not None:
                 with status:
-                    await _show_imported(visit, found, str(kind.value))
+                    await _show_imported(visit, found, kind.value)
 
         upload = ui.upload(
             label=texts.DROP,
@@ -198,7 +202,8 @@ def show_import(visit: Visit) -> None:
                 type="negative",
             ),
         )
-        upload.classes("w-full").props(f'aria-label="{texts.DROP_LABEL}"')
+        upload.classes("w-full")
+        ui.timer(0.2, lambda: ui.run_javascript(LABELS), once=True)
 
 
 def _placed(folder: Path, name: str, data: bytes) -> Arrived | str:

@@ -8,6 +8,7 @@ import sys
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 
@@ -36,21 +37,28 @@ LOGS = (("monday", 0), ("tuesday", 2), ("wednesday", 3))
 
 
 def demo_store(folder: Path, known: CalibratedRobot) -> Store:
-    """Return a store with a robot whose logs are on disk; motor 3 is stuck since Tuesday."""
+    """Return a store that a thread fills with a robot whose logs are in the folder.
+
+    Its motor 3 is stuck since the second log.
+    """
     store = open_store(folder / "robots.db", create=True)
-    robot = known.robot
-    plan = Plan(robot, ["healthy", "motor_3:stuck"], 2, seed=7, imperfections=known.imperfections)
+    Thread(target=_write_logs, args=(store, folder, known), name="logs", daemon=True).start()
+    return store
+
+
+def _write_logs(store: Store, folder: Path, known: CalibratedRobot) -> None:
+    plan = Plan(
+        known.robot, ["healthy", "motor_3:stuck"], 2, seed=7, imperfections=known.imperfections
+    )
     runs, midnight = simulate(plan), last_midnight().timestamp()
-    record = RobotRecord(store, "hall_2-arm_7", robot)
+    record = RobotRecord(store, "hall_2-arm_7", known.robot)
+    diagnoser = BayesDiagnoser(known.twin, known.imperfections)
     for day, (name, number) in enumerate(LOGS):
         path, at = folder / f"{name}.nc", midnight - (len(LOGS) - day) * DAY_S
         one = runs.isel(run=[number]).assign_coords(run=[name]).drop_vars(_TRUTH, errors="ignore")
         one.to_netcdf(path)
         os.utime(path, (at, at))
-        record.remember(
-            BayesDiagnoser(known.twin, known.imperfections).diagnose(one), log_file(path)
-        )
-    return store
+        record.remember(diagnoser.diagnose(one), log_file(path))
 
 
 _TRUTH = ["fault", "fault_detail", "onset", "magnitude"]

@@ -12,6 +12,7 @@ from failuretwin.app.console import texts
 from failuretwin.app.console.guard import CONFIRM
 from failuretwin.app.console.layout import (
     Cell,
+    Choice,
     Visit,
     button,
     heading,
@@ -85,6 +86,8 @@ class HistoryPage:
 
         if await worked(stored):
             ui.notify(texts.STORED, type="positive")
+            for field in (self._note, self._cause):
+                field.set_value("")
             self._draw()
 
     def _found(self, episode: FaultEpisode, verdict: str) -> None:
@@ -150,20 +153,20 @@ class HistoryPage:
         heading(texts.NOTE_REPAIR)
         names = known.robot.motor_names
         with ui.row().classes("gap-4 items-end"):
-            motor = ui.select(names, value=names[0], label=texts.MOTOR).classes("w-40")
+            motor = Choice(names, names[0], texts.MOTOR)
             part = _field(texts.PART)
 
             def work() -> None:
                 person, note = _value(self._person), _value(self._note)
                 self._store.repaired(
-                    self._name, str(motor.value), part=_value(part), person=person, note=note
+                    self._name, motor.value, part=_value(part), person=person, note=note
                 )
 
             button(texts.REPAIR, lambda: self._state(work))
 
             def undo() -> None:
                 person = _value(self._person)
-                self._store.withdraw_repair(self._name, str(motor.value), person=person)
+                self._store.withdraw_repair(self._name, motor.value, person=person)
 
             button(texts.UNDO_REPAIR, lambda: self._state(undo))
 
@@ -205,7 +208,7 @@ def _compare(visit: Visit, history: History) -> None:
 
     def draw() -> None:
         place.clear()
-        dates = [str(then.value), str(now.value)]
+        dates = [then.value, now.value]
         rows = [
             [one.motor, one.name, *_at_dates(visit, one, dates, one.motor)]
             for one in history.drifts
@@ -215,8 +218,8 @@ def _compare(visit: Visit, history: History) -> None:
             table((texts.MOTOR, texts.OFFSET, *dates, texts.CHANGE), rows)
 
     with ui.row().classes("gap-4"):
-        then = ui.select(days, value=days[0], label=texts.THEN, on_change=draw)
-        now = ui.select(days, value=days[-1], label=texts.NOW, on_change=draw)
+        then = Choice(days, days[0], texts.THEN, draw)
+        now = Choice(days, days[-1], texts.NOW, draw)
     place = ui.element("div")
     draw()
 

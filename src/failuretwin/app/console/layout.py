@@ -11,7 +11,7 @@ from urllib.parse import quote
 from zoneinfo import ZoneInfo
 
 import numpy as np
-from nicegui import run, ui
+from nicegui import events, run, ui
 
 from failuretwin.app.console import texts
 from failuretwin.app.console.desk import Desk
@@ -41,15 +41,17 @@ COLOURS = {
 STYLE = """
 body { --line: #c9d1d8; --soft: #f3f5f7; --link: #1f5f99; }
 body.body--dark { --line: #4a545d; --soft: #23292e; --link: #8ec5f4; }
-main { padding: 1rem; max-width: 110rem; margin: 0 auto; width: 100%; }
+.page { padding: 1rem; max-width: 110rem; margin: 0 auto; width: 100%; }
 h1 { font-size: 1.5rem; line-height: 2rem; font-weight: 600; margin: 0 0 .5rem; }
 h2 { font-size: 1.1rem; line-height: 1.6rem; font-weight: 600; margin: 1rem 0 .25rem; }
 p { margin: .25rem 0; overflow-wrap: anywhere; }
-main a { color: var(--link); text-decoration: underline; }
+.page a { color: var(--link); text-decoration: underline; }
 table.plain { border-collapse: collapse; width: 100%; }
 table.plain th, table.plain td { text-align: left; padding: .25rem .6rem; vertical-align: top;
   border-bottom: 1px solid var(--line); overflow-wrap: anywhere; }
 .state { color: #fff; border-radius: .3rem; padding: 0 .5rem; display: inline-block; }
+.choice { font-size: 1rem; border: 1px solid #6b757e; border-radius: .3rem; padding: .3rem .4rem;
+  background: #fff; color: #16191c; }
 .columns { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fit, minmax(20rem, 1fr)); }
 .columns > * { min-width: 0; }
 .scroll { overflow: auto; max-height: 24rem; }
@@ -151,7 +153,7 @@ def page(visit: Visit, title: str) -> Iterator[None]:
             ui.label(texts.SIGNED_IN.format(name=visit.session.name, role=visit.session.role))
             with ui.element("form").props('method="post" action="/logout"'):
                 ui.element("button").props('type="submit"').add_slot("default", texts.SIGN_OUT)
-    main = ui.element("main")
+    main = ui.element("div").classes("page")
     ui.skip_link(texts.SKIP, target=main)
 
     def look() -> None:
@@ -204,6 +206,38 @@ def state_badge(state: str) -> ui.label:
     """Draw a state by word, sign and colour."""
     words = f"{texts.SIGNS[state]} {texts.STATES[state]}"
     return text(words, "span").classes(f"state state-{state}")
+
+
+class Choice:
+    """A choice that screen readers know: the select of the browser.
+
+    Attributes:
+        value: What is chosen.
+    """
+
+    def __init__(
+        self,
+        options: Sequence[str],
+        value: str,
+        label: str,
+        on_change: Callable[[], object] = lambda: None,
+    ) -> None:
+        self.value = value
+        self._options, self._on_change = options, on_change
+        with ui.element("label").classes("flex flex-col text-sm"):
+            text(label, "span")
+            chosen = ui.element("select").classes("choice")
+            chosen.on("change", self._choose, js_handler="(e) => emit(e.target.selectedIndex)")
+            with chosen:
+                for one in options:
+                    option = text(one, "option")
+                    if one == value:
+                        option.props("selected")
+
+    def _choose(self, event: events.GenericEventArguments) -> None:
+        if isinstance(event.args, int) and 0 <= event.args < len(self._options):
+            self.value = self._options[event.args]
+            self._on_change()
 
 
 Cell = str | Callable[[], object]

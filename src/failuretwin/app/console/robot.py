@@ -15,6 +15,7 @@ from failuretwin.app.console import texts
 from failuretwin.app.console.arm import ArmScene
 from failuretwin.app.console.layout import (
     Cell,
+    Choice,
     Visit,
     button,
     heading,
@@ -158,14 +159,14 @@ class ReachPart:
         self._visit, self._known, self._scene = visit, known, scene
         heading(texts.REACH)
         names = known.robot.motor_names
-        self._motor = ui.select(["", *names], value="", label=texts.MOTOR).classes("w-40")
+        self._motor = Choice(["", *names], "", texts.MOTOR)
         self._angle = ui.number("deg", value=0.0).classes("w-28")
         self._line = text("").props('role="status"')
         self._place = ui.element("div")
         button(texts.ASK_REACH, self._ask)
 
     async def _ask(self) -> None:
-        robot, motor = self._known.robot, str(self._motor.value)
+        robot, motor = self._known.robot, self._motor.value
         angle = float(np.deg2rad(float(self._angle.value or 0.0)))
         held = (motor, angle) if motor in robot.motor_names else None
         found = await worked(_reach, self._known, held)

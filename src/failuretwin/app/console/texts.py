@@ -114,7 +114,7 @@ DROP_LABEL = "Log file"
 REFUSED = "refused: {why}"
 TOO_LARGE = "larger than {limit} MB"
 ROBOT_NAME, PROFILE = "Name of the robot in the store", "Profile"
-NOT_STORED = "Diagnosed, not stored: no store is open, or your role does not allow it."
+NOT_STORED = "Diagnosed, not stored: no robot was named, no store is open, or your role is `see`."
 
 LOGIN, NAME, PASSWORD, SIGN_IN = "Sign in", "Name", "Password", "Sign in"
 WRONG = "Name or password is wrong."
