@@ -108,7 +108,7 @@ class CheckPage:
 
     def _update(self) -> None:
         check = self._visit.desk.check
-        now = [] if check is None else [*check.lines, check.result]
+        now: list[object] = [] if check is None else [*check.lines, check.result]
         if check is None or now == self._shown:
             return
         self._shown = now

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import re
 import secrets
 import time
 import tomllib
@@ -43,6 +44,8 @@ TRIES, TRIES_S = 5, 60.0
 LARGEST_UPLOAD = 64 * 1024 * 1024
 """Largest body of a request [bytes]."""
 LARGEST_FORM = 64 * 1024
+HOST = re.compile(r"(\[[0-9a-fA-F:]+\]|[A-Za-z0-9_.-]+)(?::\d+)?")
+"""A host name or address, and a port."""
 MOST_EVENTS, EVENTS_S = 400, 2.0
 """Messages that a page may send in so many seconds."""
 POLICY = (
@@ -252,8 +255,8 @@ class Guard:
 
     def _is_foreign(self, headers: Mapping[str, str]) -> bool:
         host, origin = headers.get("host", ""), headers.get("origin")
-        name = urlsplit(f"//{host}").hostname or ""
-        if self._hosts and name not in self._hosts:
+        name = HOST.fullmatch(host)
+        if name is None or (self._hosts and name[1].strip("[]") not in self._hosts):
             return True
         return origin is not None and urlsplit(origin).netloc != host
 
@@ -316,14 +319,17 @@ def _stop_page(said: str) -> str:
 
 
 async def _form(receive: Receive) -> dict[str, str]:
-    """Return the fields of a form; one that is too large has none."""
+    """Return the fields of a form; one that is too large, or has too many, has none."""
     body, more = b"", True
     while more and len(body) <= LARGEST_FORM:
         message = await receive()
         body, more = body + message.get("body", b""), message.get("more_body", False)
     if len(body) > LARGEST_FORM:
         return {}
-    fields = parse_qs(body.decode("utf-8", "replace"), max_num_fields=10)
+    try:
+        fields = parse_qs(body.decode("utf-8", "replace"), max_num_fields=10)
+    except ValueError:
+        return {}
     return {name: values[0] for name, values in fields.items()}
 
 
