@@ -26,7 +26,7 @@ USERS = {"ada": "move", "eve": "see"}
 
 
 class ConsoleServer:
-    """A console with a demo, four times as fast as life, whose users sign in."""
+    """A console with a demo, whose users sign in."""
 
     def __init__(self, folder):
         pytest.importorskip("nicegui", reason="pip install 'failuretwin[console]'")
@@ -37,7 +37,7 @@ class ConsoleServer:
         self.start()
 
     def start(self):
-        options = ["--demo", "--demo-robots", "1", "--speed", "4", "--port", str(self.port)]
+        options = ["--demo", "--demo-robots", "0", "--port", str(self.port)]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "failuretwin", "console", *options, "--users", "users.toml"],
             cwd=self._folder,
