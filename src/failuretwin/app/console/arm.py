@@ -117,7 +117,7 @@ class ArmScene:
 
     def __init__(self, robot: Robot, label: str) -> None:
         reach = robot.reach
-        self._scene = ui.scene(480, 380, grid=(2, 20), background_color="#eef1f4", fps=20)
+        self._scene = ui.scene(480, 380, grid=(2, 20), background_color="#eef1f4", fps=10)
         self._scene.props(f'role="img" aria-label="{label}"').classes("w-full")
         self._solid = Arm(robot, self._scene, solid=True)
         self._ghost = Arm(robot, self._scene, solid=False)

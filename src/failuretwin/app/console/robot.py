@@ -43,7 +43,7 @@ CHARTED_S = 60.0
 """Time that live charts show [s]."""
 MOST_POINTS = 600
 """Points of a chart."""
-RESIDUAL_POINTS = 100
+RESIDUAL_POINTS = 60
 """Points of the chart of residuals: each is solved for."""
 MOST_LINES = 6
 """Hypotheses of the chart of probabilities."""
