@@ -47,9 +47,14 @@ class Person:
     def click(self, words):
         """Click a link or button with some words."""
         said = f"[normalize-space()='{words}' or @aria-label='{words}']"
-        target = self.find(f"//a{said}|//button{said}")
-        self.browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", target)
-        target.click()
+
+        def clicked():
+            target = self.find(f"//a{said}|//button{said}")
+            self.browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", target)
+            target.click()
+            return True
+
+        self.waits(clicked)
 
     def write(self, label, words):
         field = self.find(f"//input[@aria-label='{label}' or @name='{label}']")
@@ -138,11 +143,11 @@ def test_a_confirmation_changes_the_learned_rate_and_is_undone(person):
     person.write("Note", "<b>teeth</b> are gone")
     person.click("Confirm: episode 1")
     person.sees("confirmed, <b>teeth</b> are gone, ada")
-    assert rate_of(person, "motor_3:stuck") > before
+    person.waits(lambda: rate_of(person, "motor_3:stuck") > before)
     person.picture("console_history")
     person.click("Undo: episode 1")
     person.sees("finding 'confirmed' withdrawn")
-    assert rate_of(person, "motor_3:stuck") == before
+    person.waits(lambda: rate_of(person, "motor_3:stuck") == before)
     person.click("Reject: episode 1")
     person.sees("wrong, ada")
     person.click("Undo: episode 1")
