@@ -33,6 +33,7 @@ EXTRAS = {
         "mcap",
         "mujoco",
         "nats",
+        "nicegui",
         "paho",
         "prometheus_client",
         "pyarrow",

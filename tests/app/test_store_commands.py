@@ -72,9 +72,9 @@ def filled(told, tmp_path):
 def test_a_store_is_made_once_and_checked(run, store, tmp_path):
     before = (tmp_path / "robots.db").read_bytes()
     assert run("store", "init", *store).startswith("the store: robots.db\n")
-    assert run("store", "upgrade", *store) == "robots.db: is up to date (revision 5)\n"
+    assert run("store", "upgrade", *store) == "robots.db: is up to date (revision 6)\n"
     assert (tmp_path / "robots.db").read_bytes() == before
-    assert run("store", "check", *store) == "robots.db: revision 5; empty\nno problems\n"
+    assert run("store", "check", *store) == "robots.db: revision 6; empty\nno problems\n"
 
 
 def test_diagnoses_are_remembered_with_their_log(run, told, filled, rows, tmp_path):

@@ -75,6 +75,18 @@ def test_a_store_that_is_up_to_date_stays_as_it_is(place, store):
         refused(place, "DELETE FROM robots")
 
 
+def test_an_older_store_gets_the_newer_tables(place, store):
+    remember(store)
+    place.sql("DROP TABLE withdrawals")
+    place.sql("UPDATE alembic_version SET version_num = '5'")
+    assert Database(place.url).upgrade() == ("5", migrations.HEAD)
+    with Database(place.url).reading() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), metadata) == []
+    assert len(place.sql("SELECT * FROM runs")) == 1
+    with pytest.raises(Exception, match="append-only"):
+        refused(place, "DELETE FROM runs")
+
+
 def refused(place, statement):
     """Run SQL that must fail, and raise its error."""
     try:

@@ -16,6 +16,7 @@ from failuretwin import __version__
 from failuretwin.app.commands.act import act, reach, stop
 from failuretwin.app.commands.benchmark import benchmark, data
 from failuretwin.app.commands.check import check, design, isolability
+from failuretwin.app.commands.console import console
 from failuretwin.app.commands.data import import_, robot, simulate
 from failuretwin.app.commands.diagnose import demo, diagnose
 from failuretwin.app.commands.doctor import doctor
@@ -46,7 +47,7 @@ def cli() -> None:
 for command in (
     *(demo, import_, doctor, simulate, diagnose, evaluate, calibrate),
     *(train, study, benchmark, data, emulate, watch, act, stop, reach, check, design, isolability),
-    *(advise, robot, store, history, found, repaired, query, bridge, worker, fleet),
+    *(advise, robot, store, history, found, repaired, query, bridge, worker, fleet, console),
 ):
     cli.add_command(command)
 

@@ -61,7 +61,7 @@ class _Screen:
     def look(self, last: bool = False) -> None:
         """Report the changes since the last call."""
         shadow, monitor = self._shadow, self._shadow.monitor
-        troubles = _troubles(shadow, time.monotonic() - self._start_s)
+        troubles = troubles_of(shadow, time.monotonic() - self._start_s)
         if self._keeper is not None and self._keeper.trouble:
             troubles += (self._keeper.trouble,)
         jumps = shadow.clock.jumps
@@ -162,7 +162,7 @@ def fit_of(monitor: FaultMonitor) -> str:
     return f"{said}; after {counted(fit.seen, 'movement')} {profile}"
 
 
-def _troubles(shadow: Shadow, since_s: float) -> tuple[str, ...]:
+def troubles_of(shadow: Shadow, since_s: float) -> tuple[str, ...]:
     """Return the obstacles to a diagnosis and its publication, `since_s` [s] after the start."""
     found = [sink.trouble for sink in shadow.sinks if sink.trouble]
     if shadow.source.counts.received == 0 and since_s > SILENCE_S:

@@ -246,12 +246,21 @@ def found(
 @click.argument("robot")
 @click.argument("motor")
 @click.option("--part", default="", metavar="TEXT", help="The part that was replaced.")
+@opt.flag_option("--withdraw", "Take the last repair of the motor back.")
 @person_option
 @note_option
 @store_option
-def repaired(robot: str, motor: str, part: str, person: str, note: str, store: str | None) -> None:
+def repaired(
+    robot: str, motor: str, part: str, withdraw: bool, person: str, note: str, store: str | None
+) -> None:
     """State that a MOTOR of a ROBOT was repaired. The next healthy run clears its episode."""
-    ft.open_store(_url(store)).repaired(robot, motor, part=part, person=person, note=note)
+    opened = ft.open_store(_url(store))
+    if withdraw:
+        opt.refuse_unused("a repair is taken back", "part")
+        opened.withdraw_repair(robot, motor, person=person, note=note)
+        tell(f"{robot}, {motor}: last repair taken back")
+        return
+    opened.repaired(robot, motor, part=part, person=person, note=note)
     tell(f"{robot}, {motor}: {f'{part} replaced' if part else 'repaired'}")
 
 

@@ -24,6 +24,7 @@ from failuretwin.data_knowledge.records.history import (
     stored_calibration,
 )
 from failuretwin.data_knowledge.records.schema import (
+    STANDING,
     calibrations,
     diagnoses,
     episodes,
@@ -186,7 +187,7 @@ def _lives(connection: sa.Connection, robot: int | None = None) -> list[_Life]:
     if robot is not None:
         query = query.where(kinds.c.robot_id == robot)
     repaired: dict[int, dict[str, list[datetime]]] = {}
-    for one in connection.execute(sa.select(repairs).order_by(repairs.c.at)):
+    for one in connection.execute(sa.select(repairs).where(STANDING).order_by(repairs.c.at)):
         repaired.setdefault(one.robot_id, {}).setdefault(one.motor, []).append(one.at)
     return [
         _Life(

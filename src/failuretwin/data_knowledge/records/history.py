@@ -13,6 +13,7 @@ from failuretwin.core.errors import counted
 from failuretwin.data_knowledge.records.episodes import CLEARED, CONFIRMED, RAISED, SUSPECTED
 from failuretwin.data_knowledge.records.offsets import Drift, read_drifts
 from failuretwin.data_knowledge.records.schema import (
+    STANDING,
     calibrations,
     diagnoses,
     episode_events,
@@ -352,8 +353,8 @@ def stored_calibration(one: Any) -> StoredCalibration:
 
 
 def _repairs(connection: sa.Connection, row: int) -> tuple[Repair, ...]:
-    query = sa.select(repairs).where(repairs.c.robot_id == row).order_by(repairs.c.at, repairs.c.id)
-    rows = connection.execute(query)
+    query = sa.select(repairs).where(repairs.c.robot_id == row, STANDING)
+    rows = connection.execute(query.order_by(repairs.c.at, repairs.c.id))
     return tuple(Repair(one.at, one.motor, one.part, one.person, one.note) for one in rows)
 
 

@@ -26,6 +26,12 @@ from failuretwin.data_knowledge.records.fleet import (
     motor_ages,
 )
 from failuretwin.data_knowledge.records.history import History, StoredCalibration, read_history
+from failuretwin.data_knowledge.records.overview import (
+    RobotGlance,
+    StoredRun,
+    read_overview,
+    read_runs_of,
+)
 from failuretwin.data_knowledge.records.queries import QueryAnswer, ask
 from failuretwin.data_knowledge.records.schema import robots
 from failuretwin.data_knowledge.records.statements import calibration_in_force
@@ -90,6 +96,20 @@ class StoreReader:
         """
         with self._database.reading() as connection:
             return read_history(connection, writing.find_robot(connection, robot), robot)
+
+    def overview(self) -> tuple[RobotGlance, ...]:
+        """Return all robots with their last diagnosis and open faults, by name."""
+        with self._database.reading() as connection:
+            return read_overview(connection)
+
+    def runs(self, robot: str) -> tuple[StoredRun, ...]:
+        """Return the last diagnosed runs of a robot, the newest first.
+
+        Raises:
+            InputError: If the store does not know the robot.
+        """
+        with self._database.reading() as connection:
+            return read_runs_of(connection, writing.find_robot(connection, robot))
 
     def query(self, name: str, days: float = CHECK_DAYS) -> QueryAnswer:
         """Return the answer to a ready question.

@@ -302,3 +302,17 @@ repairs = sa.Table(
     _needed("at", Utc),
 )
 """Repairs and replaced parts."""
+
+withdrawals = sa.Table(
+    "withdrawals",
+    metadata,
+    _key(),
+    _of("repairs"),
+    _needed("person", Text),
+    _needed("note", Text),
+    _needed("at", Utc),
+)
+"""Repairs that somebody took back; both rows stay."""
+
+STANDING = ~sa.exists().where(withdrawals.c.repair_id == repairs.c.id)
+"""Whether a repair was not withdrawn."""

@@ -17,7 +17,13 @@ from failuretwin.data_knowledge.records.history import (
     read_episodes,
 )
 from failuretwin.data_knowledge.records.rows import add_rows
-from failuretwin.data_knowledge.records.schema import calibrations, findings
+from failuretwin.data_knowledge.records.schema import (
+    STANDING,
+    calibrations,
+    findings,
+    repairs,
+    withdrawals,
+)
 
 
 def add_finding(
@@ -52,6 +58,26 @@ def _episode(connection: sa.Connection, row: int, robot: str, number: int) -> Fa
         valid = ", ".join(str(one.number) for one in all_of_it) or "none so far"
         raise InputError(f"robot {robot!r} has no episode {number}. Its episodes: {valid}.")
     return found
+
+
+def withdraw_last_repair(
+    connection: sa.Connection, robot: str, motor: str, stated: Mapping[str, Any]
+) -> None:
+    """Take back the last repair of a motor that stands.
+
+    Raises:
+        InputError: If there is no such robot, or no repair of that motor.
+    """
+    row = writing.find_locked(connection, robot)
+    query = sa.select(repairs.c.id).where(repairs.c.robot_id == row, STANDING)
+    query = query.where(repairs.c.motor == motor).order_by(repairs.c.id.desc()).limit(1)
+    last = connection.scalar(query)
+    if last is None:
+        raise InputError(
+            f"{motor} of {robot!r} has no repair to withdraw. Expected one of "
+            "`failuretwin repaired`."
+        )
+    add_rows(connection, withdrawals, [{**stated, "repair_id": last, "at": datetime.now(UTC)}])
 
 
 def calibration_in_force(connection: sa.Connection, robot: int) -> StoredCalibration | None:

@@ -47,6 +47,7 @@ from failuretwin.data_knowledge.records.sessions import Note, Session, follow_no
 from failuretwin.data_knowledge.records.statements import (
     add_finding,
     replace_calibration,
+    withdraw_last_repair,
 )
 from failuretwin.digital_model.robot import Robot
 
@@ -343,6 +344,16 @@ class Store(StoreReader):
             stated = {"motor": motor, "part": part, "person": person, "note": note}
             when = {"robot_id": row, "at": _or_now(at)}
             add_rows(connection, repairs, [{**stated, **when}])
+
+    def withdraw_repair(self, robot: str, motor: str, *, person: str = "", note: str = "") -> None:
+        """Take back the last repair of a motor; both stay in the store.
+
+        Raises:
+            InputError: If there is no such robot, or no repair of the motor that stands.
+            OutputError: If it could not be stored.
+        """
+        with self._database.writing() as connection:
+            withdraw_last_repair(connection, robot, motor, {"person": person, "note": note})
 
     # Calibrations.
 

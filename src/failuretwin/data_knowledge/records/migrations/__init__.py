@@ -18,7 +18,7 @@ from failuretwin.data_knowledge.records.schema import metadata
 if TYPE_CHECKING:
     from alembic.config import Config
 
-HEAD = "5"
+HEAD = "6"
 """Revision that this version of the package reads and writes."""
 REVISION_TABLE = "alembic_version"
 """Table in which alembic keeps the revision."""

@@ -26,10 +26,15 @@ def guard(connection: sa.Connection) -> None:
     if connection.dialect.name == "postgresql":
         connection.exec_driver_sql(FUNCTION.replace("%", "%%"))
     for table in metadata.sorted_tables:
-        if connection.dialect.name == "sqlite":
-            _on_sqlite(connection, table)
-        else:
-            _on_postgresql(connection, table.name)
+        guard_table(connection, table)
+
+
+def guard_table(connection: sa.Connection, table: sa.Table) -> None:
+    """Add the triggers of one table."""
+    if connection.dialect.name == "sqlite":
+        _on_sqlite(connection, table)
+    else:
+        _on_postgresql(connection, table.name)
 
 
 def _on_sqlite(connection: sa.Connection, table: sa.Table) -> None:

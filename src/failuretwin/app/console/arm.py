@@ -1,0 +1,138 @@
+"""The arm in 3-D: links between the joint frames of its URDF, where it is and where it was told.
+
+It is drawn in the pose that the tool path belongs to, `Robot.sensor_sense`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import cos, sin
+
+import numpy as np
+from nicegui import ui
+from nicegui.elements.scene.scene_object3d import Object3D
+
+from failuretwin.app.console.state import SUSPECT
+from failuretwin.core.hypothesis import SURE
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.digital_model.robot import Robot
+
+THICK = 0.03
+"""Radius of a link, as a share of the reach of the arm."""
+GHOST, LINK = "#2f7fd0", "#7d8790"
+SHADES = ((SURE, "#b3261e"), (SUSPECT, "#d98e00"), (0.0, "#1b6e3c"))
+"""Colour of a motor from a probability of a fault on."""
+REACHED, MISSED = [0.11, 0.43, 0.24], [0.7, 0.15, 0.12]
+
+
+class Arm:
+    """An arm of a scene, whose joints are groups in groups.
+
+    Args:
+        robot: The robot.
+        solid: Whether it is drawn solid; a ghost is transparent.
+    """
+
+    def __init__(self, robot: Robot, scene: ui.scene, solid: bool) -> None:
+        self._robot = robot
+        self._slides = robot.slides
+        self._joints: list[Object3D] = []
+        self._motors: list[Object3D] = []
+        self._shade = [""] * len(robot.motors)
+        transforms, _ = robot.chain.constants
+        radius = THICK * robot.reach * (1.0 if solid else 0.8)
+        colour, opacity = (LINK, 1.0) if solid else (GHOST, 0.35)
+        with scene:
+            self._link(transforms[0][:3, 3], radius, colour, opacity)
+            self._grow(scene, list(transforms), radius, colour, opacity, solid)
+
+    def _grow(
+        self,
+        scene: ui.scene,
+        transforms: list[FloatArray],
+        radius: float,
+        colour: str,
+        opacity: float,
+        solid: bool,
+    ) -> None:
+        """Draw a joint and what it carries."""
+        place, rest = transforms[0], transforms[1:]
+        with scene.group().move(*place[:3, 3].tolist()).rotate_R(place[:3, :3].tolist()):
+            if not rest:
+                scene.sphere(0.7 * radius).material(colour, opacity)
+                return
+            with scene.group() as joint:
+                self._joints.append(joint)
+                motor = scene.sphere(1.5 * radius).material(colour, opacity)
+                if solid:
+                    self._motors.append(motor)
+                self._link(rest[0][:3, 3], radius, colour, opacity)
+                self._grow(scene, rest, radius, colour, opacity, solid)
+
+    def _link(self, end: FloatArray, radius: float, colour: str, opacity: float) -> None:
+        length = float(np.linalg.norm(end))
+        if length < 1e-6:
+            return
+        cylinder = ui.scene.cylinder(radius, radius, length, 16).material(colour, opacity)
+        cylinder.move(*(0.5 * end).tolist()).rotate_R(_turned_to(end / length))
+
+    def pose(self, angles: FloatArray) -> None:
+        """Move the joints to angles in the sense of the log, (motor,) [rad or m]."""
+        for joint, slides, value in zip(
+            self._joints, self._slides, (angles * self._robot.sensor_sense).tolist(), strict=True
+        ):
+            if slides:
+                joint.move(0.0, 0.0, round(value, 5))
+                continue
+            c, s = round(cos(value), 5), round(sin(value), 5)
+            joint.rotate_R([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+    def colour(self, shares: Mapping[str, float]) -> None:
+        """Colour the motors by their probability of a fault."""
+        for k, name in enumerate(self._robot.motor_names):
+            shade = next(c for least, c in SHADES if shares.get(name, 0.0) >= least)
+            if self._shade[k] != shade and self._motors:
+                self._motors[k].material(shade, 1.0)
+                self._shade[k] = shade
+
+
+def _turned_to(direction: FloatArray) -> list[list[float]]:
+    """Return the rotation that turns y, the axis of a cylinder, to a unit vector."""
+    y = np.array([0.0, 1.0, 0.0])
+    axis, c = np.cross(y, direction), float(y @ direction)
+    if c < -1.0 + 1e-9:
+        return [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
+    K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    turned: list[list[float]] = (np.eye(3) + K + K @ K / (1.0 + c)).tolist()
+    return turned
+
+
+class ArmScene:
+    """A scene with an arm where it is, its ghost where it was told to be, and points.
+
+    Args:
+        robot: The robot.
+        label: What the scene shows, for screen readers.
+    """
+
+    def __init__(self, robot: Robot, label: str) -> None:
+        reach = robot.reach
+        self._scene = ui.scene(480, 380, grid=(2, 20), background_color="#eef1f4", fps=10)
+        self._scene.props(f'role="img" aria-label="{label}"').classes("w-full")
+        self._solid = Arm(robot, self._scene, solid=True)
+        self._ghost = Arm(robot, self._scene, solid=False)
+        with self._scene:
+            self._points = ui.scene.point_cloud([], point_size=0.012 * reach / 0.3)
+        near = 0.85 * reach
+        self._scene.move_camera(near, -near, 0.9 * near, 0.0, 0.0, 0.35 * reach, duration=0.0)
+
+    def show(self, pose: FloatArray, command: FloatArray, shares: Mapping[str, float]) -> None:
+        """Draw both arms: poses in the sense of the log, (motor,) [rad or m]."""
+        self._solid.pose(pose)
+        self._ghost.pose(command)
+        self._solid.colour(shares)
+
+    def points(self, points: FloatArray, reached: BoolArray) -> None:
+        """Draw points (point, 3) [m] in green where they can be reached, else in red."""
+        colours = [REACHED if one else MISSED for one in reached.tolist()]
+        self._points.set_points(points.tolist(), colours)

@@ -1,0 +1,154 @@
+"""A check that runs while the console is open, and what stops it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from threading import Event, Thread
+
+import numpy as np
+
+from failuretwin.app.console import texts
+from failuretwin.connection.links import base
+from failuretwin.connection.links.base import Commander, Order, Reading
+from failuretwin.core.errors import FailureTwinError
+from failuretwin.core.types import FloatArray
+from failuretwin.decision.acting.work import Halted
+from failuretwin.decision.test_motions.health_check import Checking, CheckResult
+
+HANGS_S = 5.0
+"""A console that does not beat for so long hangs, and the arm is stopped [s]."""
+HOLD_S = 0.1
+"""Duration of the order to stay [s]."""
+
+
+@dataclass
+class Stoppable(Commander):
+    """An arm whose orders end when somebody stops it.
+
+    Attributes:
+        arm: The arm.
+        why: Returns why it must stop; empty: it may go on.
+        position: Angles that were read last, (motor,) [rad]; None: none were.
+    """
+
+    arm: Commander
+    why: Callable[[], str]
+    position: FloatArray | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the arm."""
+        return self.arm.name
+
+    @property
+    def ended(self) -> bool:
+        """Whether the arm has ended."""
+        return self.arm.ended
+
+    @property
+    def counts(self) -> base.LinkCounts:
+        """Counters of the link."""
+        return self.arm.counts
+
+    @property
+    def standing(self) -> FloatArray | None:
+        """Last target of the motors, (motor,) [rad]; None: not known."""
+        return self.arm.standing
+
+    def send(self, order: Order) -> None:
+        """Send an order, unless the arm must stop.
+
+        Raises:
+            Halted: If it must.
+        """
+        self._stop_if_told()
+        self.arm.send(order)
+
+    def poll(self, timeout_s: float) -> base.Event | None:
+        """Return what the arm says next.
+
+        Raises:
+            Halted: If the arm must stop; it is then told to stay where it is.
+        """
+        self._stop_if_told()
+        event = self.arm.poll(timeout_s)
+        if isinstance(event, Reading) and event.position is not None:
+            self.position = event.position
+        return event
+
+    def _stop_if_told(self) -> None:
+        why = self.why()
+        if not why:
+            return
+        place = self.position if self.position is not None else self.arm.standing
+        if place is not None and np.isfinite(place).all():
+            self.arm.send(Order(place, np.full(len(place), HOLD_S)))
+        raise Halted(f"{why}; nothing more is sent.")
+
+
+@dataclass
+class CheckRun:
+    """A check in a thread of its own.
+
+    Attributes:
+        robot: Name of the robot.
+        checking: The settings.
+        open_arm: Opens the arm on a stack.
+        hangs: Returns why the console cannot stop it any more; empty: it can.
+        lines: What happened.
+        result: What was found; None: not yet.
+    """
+
+    robot: str
+    checking: Checking
+    open_arm: Callable[[ExitStack], Commander]
+    hangs: Callable[[], str]
+    finished: Callable[[CheckResult], None]
+    lines: list[str] = field(default_factory=list)
+    result: CheckResult | None = None
+    _told: str = ""
+    _over: Event = field(default_factory=Event)
+
+    @property
+    def running(self) -> bool:
+        """Whether it goes on."""
+        return not self._over.is_set()
+
+    def start(self, seconds: float) -> None:
+        """Design the movements, and make them."""
+        Thread(target=self._run, args=(seconds,), name="check", daemon=True).start()
+
+    def stop(self, why: str) -> None:
+        """Stop the arm where it is."""
+        self._told = self._told or why
+
+    def _run(self, seconds: float) -> None:
+        self.lines.append(texts.STARTED.format(robot=self.robot))
+        try:
+            with ExitStack() as stack:
+                motions = self.checking.motions(seconds)
+                arm = Stoppable(self.open_arm(stack), lambda: self._told or self.hangs())
+                result = self.checking.carry_out(motions, 0, arm, self.lines.append)
+            self.finished(result)
+            self.result = result
+            self.lines.append(texts.FINISHED)
+        except FailureTwinError as error:
+            self.lines.append(str(error))
+        finally:
+            self._over.set()
+
+
+def beat_watch(
+    beat_s: Callable[[], float], begun_by_is_there: Callable[[], bool]
+) -> Callable[[], str]:
+    """Return what tells why a check must stop by itself: the console hangs, or its page is gone."""
+
+    def why() -> str:
+        if time.monotonic() - beat_s() > HANGS_S:
+            return texts.HANG
+        return "" if begun_by_is_there() else texts.GONE
+
+    return why

@@ -1,0 +1,99 @@
+"""The console without a robot: emulated arms at work, and a fleet with a year of history."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+
+from failuretwin.app.console.live import LiveRobot, LiveSettings
+from failuretwin.app.remembering import RobotRecord
+from failuretwin.app.simulated_years import last_midnight
+from failuretwin.connection.links.base import Source
+from failuretwin.connection.links.replay import Pace
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.data_knowledge.records.log_files import log_file
+from failuretwin.data_knowledge.records.store import Store, open_store
+from failuretwin.decision.streaming.monitor import monitor
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+from failuretwin.inference.diagnoser import BayesDiagnoser
+
+DAY_S = 86_400
+YEAR_SEED = 5
+ARMS = {
+    "hall_1-arm_1": ((), 0.0),
+    "hall_1-arm_2": (("motor_3:stuck@24",), 0.0),
+    "hall_1-arm_3": ((), 30.0),
+}
+"""Emulated arms: their faults, and when each falls silent [s]; 0: never."""
+LOGS = (("monday", 0), ("tuesday", 2), ("wednesday", 3))
+"""Logs of a robot with a stuck motor: name and number of the simulated run."""
+
+
+def demo_store(folder: Path, known: CalibratedRobot) -> Store:
+    """Return a store that a thread fills with a robot whose logs are in the folder.
+
+    Its motor 3 is stuck since the second log.
+    """
+    store = open_store(folder / "robots.db", create=True)
+    Thread(target=_write_logs, args=(store, folder, known), name="logs", daemon=True).start()
+    return store
+
+
+def _write_logs(store: Store, folder: Path, known: CalibratedRobot) -> None:
+    plan = Plan(
+        known.robot, ["healthy", "motor_3:stuck"], 2, seed=7, imperfections=known.imperfections
+    )
+    runs, midnight = simulate(plan), last_midnight().timestamp()
+    record = RobotRecord(store, "hall_2-arm_7", known.robot)
+    diagnoser = BayesDiagnoser(known.twin, known.imperfections)
+    for day, (name, number) in enumerate(LOGS):
+        path, at = folder / f"{name}.nc", midnight - (len(LOGS) - day) * DAY_S
+        one = runs.isel(run=[number]).assign_coords(run=[name]).drop_vars(_TRUTH, errors="ignore")
+        one.to_netcdf(path)
+        os.utime(path, (at, at))
+        record.remember(diagnoser.diagnose(one), log_file(path))
+
+
+_TRUTH = ["fault", "fault_detail", "onset", "magnitude"]
+
+
+def write_history(store: Store, robots: int, years: float) -> subprocess.Popen[bytes]:
+    """Simulate years of a fleet into a store, robot by robot, in a process that is returned."""
+    fleet = ["--fleet", str(robots), "--years", str(years), "--seed", str(YEAR_SEED)]
+    command = [sys.executable, "-m", "failuretwin", "simulate", *fleet, "--store", store.name]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def demo_arms(known: CalibratedRobot, speed: float) -> dict[str, LiveRobot]:
+    """Return the emulated arms, not yet watched."""
+    found = {}
+    for k, (name, (faults, silent_s)) in enumerate(ARMS.items()):
+        opened = partial(_emulated, known, faults, silent_s, k, speed)
+        watch = monitor(known.twin, known.imperfections)
+        still = tuple(fault.partition("@")[0] for fault in faults)
+        found[name] = LiveRobot(LiveSettings(name, known, watch, opened, faults=still))
+    return found
+
+
+def _emulated(
+    known: CalibratedRobot,
+    faults: tuple[str, ...],
+    silent_s: float,
+    seed: int,
+    speed: float,
+    stack: ExitStack,
+) -> Source:
+    from failuretwin.app.arms import emulation_with
+    from failuretwin.connection.emulated_arm import EmulatedArm, Shifts
+
+    shifts = Shifts(break_s=0.0, duration_s=silent_s or np.inf)
+    return stack.enter_context(
+        EmulatedArm(emulation_with(faults, known, seed), Pace(speed), shifts)
+    )

@@ -1,0 +1,274 @@
+"""What the console reads from and writes to: the store, the fleet and live robots."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from threading import Event, Thread
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.app.console import state as shown
+from failuretwin.app.console.checking import CheckRun
+from failuretwin.app.console.live import LiveRobot
+from failuretwin.app.console.state import Tile, Trace
+from failuretwin.app.remembering import RobotRecord
+from failuretwin.connection.fleet.broker import Access, open_broker
+from failuretwin.core.errors import FailureTwinError, InputError
+from failuretwin.core.movements import find_movements
+from failuretwin.core.types import as_floats
+from failuretwin.data_knowledge.readers.read import read_runs
+from failuretwin.data_knowledge.records.log_files import log_file
+from failuretwin.data_knowledge.records.overview import RobotGlance, StoredRun
+from failuretwin.data_knowledge.records.store import Store
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
+from failuretwin.digital_model.robot import bundled_robots, load_robot
+from failuretwin.inference.diagnoser import BayesDiagnoser
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from failuretwin.core.hypothesis import Diagnosis
+
+LOOK_S = 2.0
+"""Time between two looks into the store [s]."""
+STATUS_S = 1.0
+"""Time between two looks at the fleet [s]."""
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A log that was diagnosed: its runs, their diagnoses, and what was stored, a line each."""
+
+    runs: xr.Dataset
+    diagnoses: Sequence[Diagnosis]
+    stored: Sequence[str]
+
+
+@dataclass
+class Desk:
+    """The sources of the console.
+
+    Attributes:
+        known: The robot of the command line, calibrated.
+        store: The store; None: none is open.
+        access: The fleet; None: none is named.
+        live: Live robots by name.
+        move: Whether a real arm may be moved.
+        speed: How fast time of emulated arms passes.
+        folder: Folder for logs that are imported, and for pages.
+        trouble: Why store or fleet cannot be read at present; empty: they can.
+        check: The last check; None: none so far.
+        reports: Pages for technicians by number.
+        beat_s: When the server worked last, by the monotonic clock [s].
+    """
+
+    known: CalibratedRobot
+    store: Store | None
+    access: Access | None
+    live: dict[str, LiveRobot]
+    move: bool
+    speed: float
+    folder: Path
+    trouble: str = ""
+    check: CheckRun | None = None
+    reports: dict[int, str] = field(default_factory=dict)
+    beat_s: float = field(default_factory=time.monotonic)
+    _glances: tuple[RobotGlance, ...] = ()
+    _fleet: tuple[Tile, ...] = ()
+    _stopped: Event = field(default_factory=Event)
+
+    def start(self) -> None:
+        """Begin to look at all sources."""
+        for robot in self.live.values():
+            robot.start()
+        if self.store is not None:
+            self.look()
+            Thread(target=self._look_into_store, name="store", daemon=True).start()
+        if self.access is not None:
+            fleet = Thread(target=lambda: asyncio.run(self._look_at_fleet()), daemon=True)
+            fleet.start()
+
+    def stop(self) -> None:
+        """End all threads, and the check."""
+        self._stopped.set()
+        for robot in self.live.values():
+            robot.stop()
+        if self.check is not None:
+            self.check.stop("the console ends")
+
+    # The wall.
+
+    def tiles(self) -> list[Tile]:
+        """Return all robots, the worst first: live ones, else by the fleet, else by the store."""
+        now = datetime.now(UTC)
+        found = {one.robot: shown.stored_tile(one, now) for one in self._glances}
+        kinds = {name: tile.kind for name, tile in found.items()}
+        for tile in self._fleet:
+            found[tile.name] = replace(tile, kind=kinds.get(tile.name, tile.kind))
+        found |= {name: robot.view.tile for name, robot in self.live.items()}
+        return shown.worst_first(list(found.values()))
+
+    def tile(self, name: str) -> Tile | None:
+        """Return a robot; None: it is not known."""
+        return next((tile for tile in self.tiles() if tile.name == name), None)
+
+    def look(self) -> None:
+        """Read the store now."""
+        if self.store is not None:
+            self._glances = self.store.overview()
+
+    def _look_into_store(self) -> None:
+        while not self._stopped.wait(LOOK_S):
+            try:
+                self.look()
+                self.trouble = ""
+            except FailureTwinError as error:
+                self.trouble = str(error)
+
+    async def _look_at_fleet(self) -> None:
+        from failuretwin.app.fleet import read_status
+
+        assert self.access is not None
+        broker, status = None, None
+        while not self._stopped.is_set():
+            try:
+                broker = broker or await open_broker(self.access, "console")
+                status = await asyncio.wait_for(read_status(broker), 5.0)
+                self.trouble = ""
+            except (FailureTwinError, OSError, TimeoutError) as error:
+                self.trouble = f"fleet: {error or 'no answer'}"
+            if status is not None:
+                kinds = {one.robot: one.kind for one in self._glances}
+                self._fleet = tuple(shown.fleet_tiles(status, kinds, time.time()))
+            await asyncio.sleep(STATUS_S)
+
+    # Robots.
+
+    def robot(self, name: str) -> CalibratedRobot | None:
+        """Return a robot, calibrated as the store says; None: its profile is not known here."""
+        live = self.live.get(name)
+        if live is not None:
+            return live.settings.known
+        tile = self.tile(name)
+        return None if tile is None else self.of_kind(tile.kind, name)
+
+    def of_kind(self, kind: str, name: str = "") -> CalibratedRobot | None:
+        """Return a robot of a profile, with the calibration of the store if it has one."""
+        if kind in ("", self.known.robot.name):
+            known = self.known
+        elif kind in bundled_robots():
+            known = load_calibration(None, load_robot(kind))
+        else:
+            return None
+        record = self.record(name, known)
+        return record.calibrated or known if record is not None else known
+
+    def record(self, name: str, known: CalibratedRobot) -> RobotRecord | None:
+        """Return a robot in the store, with its calibration; None: no store, or no name."""
+        if self.store is None or not name:
+            return None
+        record = RobotRecord(self.store, name, known.robot)
+        return replace(record, calibration=self.store.calibration(name))
+
+    def diagnose(self, path: Path, kind: str, name: str) -> Imported:
+        """Diagnose a log, and store the diagnoses as those of a robot; no name: store nothing.
+
+        Raises:
+            InputError: If it cannot be read.
+            OutputError: If it cannot be stored.
+        """
+        known = self.of_kind(kind, name)
+        if known is None:
+            raise InputError(
+                f"unknown profile {kind!r}. Expected a bundled robot or that of --robot."
+            )
+        runs = read_runs(path, known.robot)
+        diagnoses = BayesDiagnoser(known.twin, known.imperfections).diagnose(runs)
+        record = self.record(name, known)
+        lines: list[str] = []
+        if record is not None:
+            done = record.remember(diagnoses, log_file(path), runs)
+            from failuretwin.app.records import episode_line
+
+            lines = [f"{done.added} added, {done.known} known before"]
+            lines += map(episode_line, done.episodes)
+            self.look()
+        return Imported(runs, diagnoses, lines)
+
+    def stored_runs(self, name: str) -> tuple[StoredRun, ...]:
+        """Return the runs of a robot in the store, the newest first; empty: there are none."""
+        if self.store is None or name not in {one.robot for one in self._glances}:
+            return ()
+        return self.store.runs(name)
+
+    def stored_trace(self, name: str, row: int) -> Trace:
+        """Return the motion of a run in the store, and its diagnosis by this version.
+
+        Raises:
+            InputError: If there is no such run, or its log is not here.
+        """
+        run = next((one for one in self.stored_runs(name) if one.row == row), None)
+        known = self.robot(name)
+        if run is None or known is None or not Path(run.log).exists():
+            raise InputError(f"run {row} of {name!r}: its log is not on this computer.")
+        return trace_of(read_runs(run.log, known.robot).isel(run=[run.position]), known)
+
+    # What is worked out when it is asked for.
+
+    def blind_spots(self, trace: Trace, known: CalibratedRobot) -> list[str]:
+        """Return what a motion could not show, in sentences."""
+        from failuretwin.app.reports.isolability_report import group_lines, size_lines
+        from failuretwin.inference.isolability import isolability
+
+        grid = np.arange(0.0, float(np.ptp(trace.time)), 0.05)
+        command = np.stack(
+            [np.interp(grid, trace.time - trace.time[0], one) for one in trace.command.T], axis=-1
+        )
+        found = isolability(known.twin, command, grid, known.imperfections)
+        return [*group_lines(found, known.robot), *size_lines(found, known.robot)]
+
+    def remaining_life(self, name: str) -> list[str]:
+        """Return the remaining life of each motor, in sentences.
+
+        Raises:
+            InputError: If no run of the robot was followed.
+        """
+        from failuretwin.decision.remaining_life import LEAST_RUNS, motor_lives
+        from failuretwin.inference.observation.healthy_model import HealthyModel
+
+        known = self.robot(name)
+        record = None if known is None else self.record(name, known)
+        if known is None or record is None:
+            raise InputError("no store is open, or the robot is not known there.")
+        model = HealthyModel(known.twin, known.imperfections)
+        lives = motor_lives(record.tracked_rows(), model, np.random.default_rng(0))
+        return [
+            f"{motor}: {life.verdict}" if life else f"{motor}: fewer than {LEAST_RUNS} runs"
+            for motor, life in lives.items()
+        ]
+
+
+def trace_of(runs: xr.Dataset, known: CalibratedRobot) -> Trace:
+    """Return the motion of a single run, and its diagnosis."""
+    diagnosis = BayesDiagnoser(known.twin, known.imperfections).diagnose(runs)[0]
+    length = float(runs["duration"].values[0])
+    time_s = as_floats(runs["time"].values)
+    inside = time_s <= length
+    command = as_floats(runs["command"].values)
+    movements = find_movements(command, time_s)
+    starts = movements.start[0][movements.exists[0]]
+    measured = as_floats(runs["measured"].values)[0]
+    return Trace(
+        str(runs["run"].values[0]),
+        time_s[inside],
+        command[0][inside],
+        measured[inside],
+        starts,
+        diagnosis,
+    )

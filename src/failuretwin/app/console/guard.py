@@ -1,0 +1,395 @@
+"""Who may see and do what: passwords, sessions, roles, and requests that are refused.
+
+Passwords are kept as scrypt hashes (RFC 7914). A session is a random token in a cookie that no
+script reads and no other site sends; it is held in memory and expires. Requests of other sites
+(header Origin), requests that name another host (header Host, against DNS rebinding), bodies that
+are too large and floods of events are refused before any page sees them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import re
+import secrets
+import time
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from html import escape
+from http.cookies import SimpleCookie
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs, urlsplit
+
+import tomli_w
+
+from failuretwin.app.console import texts
+from failuretwin.core.errors import InputError, check_name
+from failuretwin.data_knowledge.store import write_text
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+SEE, CONFIRM, MOVE = "see", "confirm", "move"
+ROLES = (SEE, CONFIRM, MOVE)
+"""What a person may do: each role includes those before it."""
+SESSION_S = 8 * 3600.0
+"""Time without a request after which a session ends [s]."""
+COOKIE = "failuretwin_session"
+WORK = {"n": 2**14, "r": 8, "p": 1}
+"""Cost of a password hash: about 50 ms."""
+TRIES, TRIES_S = 5, 60.0
+"""Wrong passwords of a name in so many seconds, then it waits."""
+LARGEST_UPLOAD = 64 * 1024 * 1024
+"""Largest body of a request [bytes]."""
+LARGEST_FORM = 64 * 1024
+HOST = re.compile(r"(\[[0-9a-fA-F:]+\]|[A-Za-z0-9_.-]+)(?::\d+)?")
+"""A host name or address, and a port."""
+MOST_EVENTS, EVENTS_S = 400, 2.0
+"""Messages that a page may send in so many seconds."""
+POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
+    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
+    "connect-src 'self' ws: wss:; worker-src 'self' blob:; object-src 'none'; base-uri 'none'; "
+    "frame-ancestors 'none'; form-action 'self'"
+)
+"""Browsers load nothing from other hosts."""
+HEADERS = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "same-origin",
+}
+
+
+# Users.
+
+
+@dataclass(frozen=True)
+class User:
+    """A person: name, role and hash of the password."""
+
+    name: str
+    role: str
+    password: str
+
+
+def hashed(password: str, salt: str = "") -> str:
+    """Return ``scrypt:SALT:HASH`` of a password; an empty salt: a new one."""
+    salt = salt or secrets.token_hex(16)
+    key = hashlib.scrypt(password.encode(), salt=bytes.fromhex(salt), **WORK)
+    return f"scrypt:{salt}:{key.hex()}"
+
+
+def load_users(path: Path) -> dict[str, User]:
+    """Return the users in a file: a table of each, with ``role`` and ``password``.
+
+    Raises:
+        InputError: If it cannot be read or holds something else.
+    """
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        users = [User(name, one["role"], one["password"]) for name, one in tables.items()]
+        for user in users:
+            check_name("role", user.role, ROLES)
+            _, salt, _ = user.password.split(":")
+            bytes.fromhex(salt)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{path}: {error}. Expected a table of each user with role and password; "
+            "`failuretwin console --users FILE --add-user NAME` writes it."
+        ) from error
+    return {user.name: user for user in users}
+
+
+def add_user(path: Path, name: str, role: str, password: str) -> None:
+    """Write a user into a file, in addition to those that are there."""
+    users = load_users(path) if path.exists() else {}
+    users[name] = User(name, role, hashed(password))
+    tables = {one.name: {"role": one.role, "password": one.password} for one in users.values()}
+    write_text(tomli_w.dumps(tables), path)
+    path.chmod(0o600)
+
+
+# Sessions.
+
+
+@dataclass
+class Session:
+    """A person who is signed in.
+
+    Attributes:
+        name: The name; empty: nobody signs in here.
+        role: The role.
+        seen_s: Time of the last request [s].
+    """
+
+    name: str
+    role: str
+    seen_s: float = field(default_factory=time.monotonic)
+    ended: bool = False
+
+    @property
+    def valid(self) -> bool:
+        """Whether it has not ended."""
+        return not self.ended and (not self.name or time.monotonic() - self.seen_s < SESSION_S)
+
+    def may(self, role: str) -> bool:
+        """Return whether the person may do what a role may."""
+        return self.valid and ROLES.index(self.role) >= ROLES.index(role)
+
+
+class Sessions:
+    """Sessions of a server.
+
+    Args:
+        users: Users by name; empty: everybody on this computer has all roles.
+    """
+
+    def __init__(self, users: Mapping[str, User]) -> None:
+        self.users = users
+        self._open: dict[str, Session] = {}
+        self._wrong: dict[str, list[float]] = {}
+        self._own = Session("", MOVE)
+
+    def of(self, token: str | None) -> Session | None:
+        """Return the session of a cookie, which counts as used; None: there is none."""
+        if not self.users:
+            return self._own
+        session = self._open.get(token or "")
+        if session is None or not session.valid:
+            return None
+        session.seen_s = time.monotonic()
+        return session
+
+    def sign_in(self, name: str, password: str) -> str:
+        """Return the token of a new session; empty: name or password is wrong."""
+        user = self.users.get(name)
+        salt = user.password.split(":")[1] if user else "00" * 16
+        right = hmac.compare_digest(hashed(password, salt), user.password if user else "")
+        if user is None or not right:
+            self._wrong.setdefault(name[:64], []).append(time.monotonic())
+            return ""
+        token = secrets.token_urlsafe(32)
+        self._open[token] = Session(user.name, user.role)
+        self._open = {key: one for key, one in self._open.items() if one.valid}
+        return token
+
+    def waits(self, name: str) -> bool:
+        """Return whether a name was tried with wrong passwords too often."""
+        now_s = time.monotonic()
+        self._wrong = {
+            key: recent
+            for key, tries in self._wrong.items()
+            if (recent := [at for at in tries if now_s - at < TRIES_S])
+        }
+        return len(self._wrong.get(name[:64], [])) >= TRIES
+
+    def sign_out(self, token: str | None) -> None:
+        """End a session; its pages stop as well."""
+        session = self._open.pop(token or "", None)
+        if session is not None:
+            session.ended = True
+
+
+# The guard in front of all pages.
+
+FORM = """<!doctype html><html lang="en"><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>
+<style>:root{{color-scheme:light dark}}body{{font:1rem/1.5 system-ui,sans-serif;max-width:22rem;
+margin:10vh auto;padding:0 1rem}}label,input,button{{display:block;width:100%;font:inherit;
+box-sizing:border-box}}input,button{{padding:.5rem;margin:.2rem 0 1rem}}</style>
+<main><h1>{title}</h1>{body}</main></html>"""
+
+
+class Guard:
+    """Refuses what must not reach the pages, and signs people in and out.
+
+    Args:
+        app: The pages.
+        sessions: Sessions.
+        hosts: Host names that requests may name; empty: any, where people sign in.
+        stop: Stops a check; takes who says so and returns what happened.
+    """
+
+    def __init__(
+        self, app: ASGIApp, sessions: Sessions, hosts: frozenset[str], stop: Callable[[str], str]
+    ) -> None:
+        self._app, self._sessions, self._hosts, self._stop = app, sessions, hosts, stop
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, or answer it."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = {
+            key.decode("latin-1"): value.decode("latin-1") for key, value in scope["headers"]
+        }
+        if self._is_foreign(headers):
+            await _refuse(scope, receive, send, 403, texts.FOREIGN)
+            return
+        token = _token(headers)
+        path, session = scope["path"], self._sessions.of(token)
+        if scope["type"] == "http" and path in ("/login", "/logout", "/stop"):
+            body = await _form(receive) if scope["method"] == "POST" else None
+            answer = self._answer(path, body, token, session)
+            await _send(send, *answer)
+            return
+        if (session is None and not path.startswith("/_nicegui/")) or _is_upload_without(
+            path, session
+        ):
+            if scope["type"] == "websocket":
+                await _refuse(scope, receive, send, 403, texts.EXPIRED)
+            else:
+                await _send(send, 303, "", {"location": "/login"})
+            return
+        if scope["type"] == "websocket":
+            await self._app(scope, _counting(receive), send)
+            return
+        if int(headers.get("content-length") or 0) > LARGEST_UPLOAD:
+            limit = texts.TOO_LARGE.format(limit=LARGEST_UPLOAD // 1024**2)
+            await _refuse(scope, receive, send, 413, texts.REFUSED.format(why=limit))
+            return
+        await self._app(scope, _limited(receive), _with_headers(send))
+
+    def _is_foreign(self, headers: Mapping[str, str]) -> bool:
+        host, origin = headers.get("host", ""), headers.get("origin")
+        name = HOST.fullmatch(host)
+        if name is None or (self._hosts and name[1].strip("[]") not in self._hosts):
+            return True
+        return origin is not None and urlsplit(origin).netloc != host
+
+    def _answer(
+        self, path: str, body: Mapping[str, str] | None, token: str | None, session: Session | None
+    ) -> tuple[int, str, Mapping[str, str]]:
+        """Return status, page and headers of the pages that need no script."""
+        if path == "/stop":
+            if session is None:
+                return 303, "", {"location": "/login"}
+            said = "" if body is None else self._stop(session.name or "/stop")
+            return 200, _stop_page(said), {}
+        if path == "/logout" and body is not None:
+            self._sessions.sign_out(token)
+            return 303, "", {"location": "/login", "set-cookie": f"{COOKIE}=; Max-Age=0; Path=/"}
+        if path == "/logout":
+            return 303, "", {"location": "/"}
+        if body is None:
+            return 200, _login_page(""), {}
+        name, password = body.get("name", ""), body.get("password", "")
+        if self._sessions.waits(name):
+            return 429, _login_page(texts.TOO_OFTEN), {}
+        made = self._sessions.sign_in(name, password)
+        if not made:
+            return 401, _login_page(texts.WRONG), {}
+        cookie = f"{COOKIE}={made}; HttpOnly; SameSite=Strict; Path=/"
+        return 303, "", {"location": "/", "set-cookie": cookie}
+
+
+def _is_upload_without(path: str, session: Session | None) -> bool:
+    """Return whether somebody who is not signed in reaches for more than scripts and styles."""
+    return session is None and path.startswith("/_nicegui/client/")
+
+
+def _token(headers: Mapping[str, str]) -> str | None:
+    try:
+        morsel = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+    except Exception:  # any cookie that another program has set
+        return None
+    return None if morsel is None else morsel.value
+
+
+def _login_page(wrong: str) -> str:
+    body = (
+        f'<p role="alert">{escape(wrong)}</p><form method="post" action="/login">'
+        f'<label for="name">{texts.NAME}</label><input id="name" name="name" '
+        f'autocomplete="username" required autofocus><label for="password">{texts.PASSWORD}</label>'
+        '<input id="password" name="password" type="password" autocomplete="current-password" '
+        f"required><button>{texts.SIGN_IN}</button></form>"
+    )
+    return FORM.format(title=texts.LOGIN, body=body)
+
+
+def _stop_page(said: str) -> str:
+    body = (
+        f'<p role="status">{escape(said)}</p><form method="post" action="/stop">'
+        f"<button>{texts.STOP}</button></form>"
+    )
+    return FORM.format(title=texts.STOP, body=body)
+
+
+async def _form(receive: Receive) -> dict[str, str]:
+    """Return the fields of a form; one that is too large, or has too many, has none."""
+    body, more = b"", True
+    while more and len(body) <= LARGEST_FORM:
+        message = await receive()
+        body, more = body + message.get("body", b""), message.get("more_body", False)
+    if len(body) > LARGEST_FORM:
+        return {}
+    try:
+        fields = parse_qs(body.decode("utf-8", "replace"), max_num_fields=10)
+    except ValueError:
+        return {}
+    return {name: values[0] for name, values in fields.items()}
+
+
+async def _send(send: Send, status: int, page: str, headers: Mapping[str, str]) -> None:
+    sent = {"content-type": "text/html; charset=utf-8", "cache-control": "no-store"}
+    await send({
+        "type": "http.response.start",
+        "status": status,
+        "headers": [
+            (key.encode(), value.encode()) for key, value in {**sent, **HEADERS, **headers}.items()
+        ],
+    })  # fmt: skip
+    await send({"type": "http.response.body", "body": page.encode()})
+
+
+async def _refuse(scope: Scope, receive: Receive, send: Send, status: int, why: str) -> None:
+    if scope["type"] == "websocket":
+        await receive()
+        await send({"type": "websocket.close", "code": 1008, "reason": why[:100]})
+        return
+    await _send(send, status, escape(why), {})
+
+
+def _with_headers(send: Send) -> Send:
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            known = {key.lower() for key, _ in message["headers"]}
+            more = [(k.encode(), v.encode()) for k, v in HEADERS.items() if k.encode() not in known]
+            message = {**message, "headers": [*message["headers"], *more]}
+        await send(message)
+
+    return sending
+
+
+def _limited(receive: Receive) -> Receive:
+    """Return a body that ends, as if its sender had left, once it is too large."""
+    seen = 0
+
+    async def receiving() -> Message:
+        nonlocal seen
+        message = await receive()
+        seen += len(message.get("body", b""))
+        return {"type": "http.disconnect"} if seen > LARGEST_UPLOAD else message
+
+    return receiving
+
+
+def _counting(receive: Receive) -> Receive:
+    """Return messages of a page, which is left once it sends a flood."""
+    begun_s, count = time.monotonic(), 0
+
+    async def receiving() -> Message:
+        nonlocal begun_s, count
+        message: dict[str, Any] = dict(await receive())
+        now_s = time.monotonic()
+        if now_s - begun_s > EVENTS_S:
+            begun_s, count = now_s, 0
+        count += 1
+        if count > MOST_EVENTS:
+            return {"type": "websocket.disconnect", "code": 1008, "reason": texts.FLOOD}
+        return message
+
+    return receiving

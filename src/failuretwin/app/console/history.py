@@ -1,0 +1,244 @@
+"""What a robot went through, and what people say of it: into the store, undoable."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from functools import partial
+
+from nicegui import ui
+
+from failuretwin.app.console import texts
+from failuretwin.app.console.guard import CONFIRM
+from failuretwin.app.console.layout import (
+    Cell,
+    Choice,
+    Visit,
+    button,
+    heading,
+    link_to,
+    page,
+    table,
+    text,
+    worked,
+)
+from failuretwin.connection.fault_rates import LearnedRates
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.data_knowledge.records.episodes import CONFIRMED
+from failuretwin.data_knowledge.records.history import (
+    OTHER_CAUSE,
+    WRONG,
+    FaultEpisode,
+    History,
+)
+from failuretwin.data_knowledge.records.offsets import Drift
+from failuretwin.data_knowledge.records.store import Store
+
+LONGEST = 200
+"""Length of a name, note, cause or part [letters]."""
+
+
+async def show(visit: Visit, name: str) -> None:
+    """Draw the page."""
+    desk = visit.desk
+    with page(visit, f"{texts.HISTORY}: {name}"):
+        ui.link(name, link_to("robot", name=name))
+        if desk.store is None or name not in desk.store.robots():
+            text(texts.NO_STORE if desk.store is None else texts.NO_ROBOT).props('role="alert"')
+            return
+        HistoryPage(visit, name, desk.store)
+
+
+class HistoryPage:
+    """The history of one robot; what a person states is stored and drawn anew."""
+
+    def __init__(self, visit: Visit, name: str, store: Store) -> None:
+        self._visit, self._name, self._store = visit, name, store
+        signed = visit.session.name
+        with ui.row().classes("gap-4 items-end"):
+            self._person = _field(texts.YOUR_NAME, signed)
+            if signed:
+                self._person.props("readonly")
+            self._note, self._cause = _field(texts.NOTE), _field(texts.CAUSE)
+        self._body = ui.element("div")
+        self._draw()
+
+    def _draw(self) -> None:
+        history = self._store.history(self._name)
+        self._body.clear()
+        with self._body:
+            text(history.health)
+            self._episodes(history)
+            self._repair()
+            self._rates(history.kind)
+            _timeline(self._visit, history)
+            _compare(self._visit, history)
+
+    async def _state(self, work: Callable[[], object]) -> None:
+        """Store what a person states, and draw the history anew."""
+        if not self._visit.allows(CONFIRM):
+            return
+
+        def stored() -> bool:
+            work()
+            self._visit.desk.look()
+            return True
+
+        if await worked(stored):
+            ui.notify(texts.STORED, type="positive")
+            for field in (self._note, self._cause):
+                field.set_value("")
+            self._draw()
+
+    def _found(self, episode: FaultEpisode, verdict: str) -> None:
+        self._store.found(
+            self._name,
+            episode.number,
+            verdict,
+            cause=_value(self._cause),
+            person=_value(self._person),
+            note=_value(self._note),
+        )
+
+    def _withdraw(self, episode: FaultEpisode) -> None:
+        person, note = _value(self._person), _value(self._note)
+        self._store.withdraw(self._name, episode.number, person=person, note=note)
+
+    def _episodes(self, history: History) -> None:
+        heading(texts.EPISODES)
+        time = self._visit.time
+        rows: list[list[Cell]] = []
+        for one in reversed(history.episodes):
+            found = one.finding
+            said = (
+                ""
+                if found is None
+                else ", ".join(
+                    part for part in (found.verdict, found.cause, found.note, found.person) if part
+                )
+            )
+            until = f" - {time(one.until)}" if one.until else ""
+            rows.append([
+                str(one.number),
+                f"{one.motor}: {one.mode}",
+                one.state,
+                f"{time(one.since)}{until}",
+                said,
+                self._buttons(one),
+            ])  # fmt: skip
+        heads = (texts.EPISODE, texts.FAULT, texts.STATE, texts.SINCE, texts.FINDING, "")
+        table(heads if self._visit.confirms else heads[:-1], rows)
+
+    def _buttons(self, episode: FaultEpisode) -> Callable[[], object]:
+        judging = {texts.CONFIRM: CONFIRMED, texts.REJECT: WRONG, texts.OTHER: OTHER_CAUSE}
+
+        def draw() -> None:
+            if not self._visit.confirms:
+                return
+            for words, verdict in judging.items():
+                self._button(words, episode, partial(self._found, episode, verdict))
+            if episode.finding is not None:
+                self._button(texts.UNDO, episode, partial(self._withdraw, episode))
+
+        return draw
+
+    def _button(self, words: str, episode: FaultEpisode, work: Callable[[], object]) -> None:
+        made = button(words, lambda: self._state(work)).props("outline")
+        made.props(f'aria-label="{words}: {texts.EPISODE.lower()} {episode.number}"')
+
+    def _repair(self) -> None:
+        known = self._visit.desk.robot(self._name)
+        if known is None or not self._visit.confirms:
+            return
+        heading(texts.NOTE_REPAIR)
+        names = known.robot.motor_names
+        with ui.row().classes("gap-4 items-end"):
+            motor = Choice(names, names[0], texts.MOTOR)
+            part = _field(texts.PART)
+
+            def work() -> None:
+                person, note = _value(self._person), _value(self._note)
+                self._store.repaired(
+                    self._name, motor.value, part=_value(part), person=person, note=note
+                )
+
+            button(texts.REPAIR, lambda: self._state(work))
+
+            def undo() -> None:
+                person = _value(self._person)
+                self._store.withdraw_repair(self._name, motor.value, person=person)
+
+            button(texts.UNDO_REPAIR, lambda: self._state(undo))
+
+    def _rates(self, kind: str) -> None:
+        """Draw the learned rates of the faults of this robot."""
+        known = self._visit.desk.robot(self._name)
+        if known is None:
+            return
+        heading(texts.RATES)
+        seen, ages = self._store.fleet_faults(kind), self._store.motor_ages(self._name)
+        learned = LearnedRates.of(seen, paper_hypotheses(known.robot.motor_names), ages)
+        text(learned.line)
+        rows = [[one.name, str(one.confirmed), f"{one.factor:.2f}"] for one in learned.rates]
+        table(texts.RATE_COLUMNS, rows)
+
+
+def _field(label: str, value: str = "") -> ui.input:
+    return ui.input(label, value=value).props(f"maxlength={LONGEST}").classes("w-48")
+
+
+def _value(field: ui.input) -> str:
+    return str(field.value or "").strip()[:LONGEST]
+
+
+def _timeline(visit: Visit, history: History) -> None:
+    heading(texts.TIMELINE)
+    rows = [[visit.time(one.at), one.kind, one.text] for one in reversed(history.timeline)]
+    table((texts.WHEN, texts.EVENT, texts.SAYS), rows)
+
+
+def _compare(visit: Visit, history: History) -> None:
+    """Draw the offsets of the motors at two dates."""
+    heading(texts.COMPARE)
+    known = visit.desk.robot(history.robot)
+    if not history.drifts or known is None:
+        text(texts.NO_OFFSETS)
+        return
+    days = sorted({f"{at:%Y-%m-%d}" for one in history.drifts for at in one.at})
+
+    def draw() -> None:
+        place.clear()
+        dates = [then.value, now.value]
+        rows = [
+            [one.motor, one.name, *_at_dates(visit, one, dates, one.motor)]
+            for one in history.drifts
+            if one.motor in known.robot.motor_names
+        ]
+        with place:
+            table((texts.MOTOR, texts.OFFSET, *dates, texts.CHANGE), rows)
+
+    with ui.row().classes("gap-4"):
+        then = Choice(days, days[0], texts.THEN, draw)
+        now = Choice(days, days[-1], texts.NOW, draw)
+    place = ui.element("div")
+    draw()
+
+
+def _at_dates(visit: Visit, drift: Drift, dates: list[str], motor: str) -> list[str]:
+    """Return an offset at two dates, and the change between them."""
+    known = visit.desk.known.robot
+    values = []
+    for day in dates:
+        end = datetime.fromisoformat(day).replace(tzinfo=UTC).timestamp() + 86_400.0
+        before = [k for k, at in enumerate(drift.at) if at.timestamp() < end]
+        values.append(before[-1] if before else 0)
+    angle = drift.unit == "rad" and motor in known.motor_names
+
+    def word(value: float) -> str:
+        if angle:
+            return visit.angle(value, known, known.motor_names.index(motor), relative=True)
+        return f"{value:.4g} {drift.unit}"
+
+    told = [f"{word(drift.values[k])} ± {word(abs(drift.deviations[k]))}" for k in values]
+    change = drift.values[values[1]] - drift.values[values[0]]
+    return [*told, word(change)]

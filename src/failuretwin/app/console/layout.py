@@ -1,0 +1,283 @@
+"""What all pages share: header, colours, units, time zone, tables, and who is at the page."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from typing import TYPE_CHECKING, TypeVar
+from urllib.parse import quote
+from zoneinfo import ZoneInfo
+
+import numpy as np
+from nicegui import events, run, ui
+
+from failuretwin.app.console import texts
+from failuretwin.app.console.desk import Desk
+from failuretwin.app.console.guard import CONFIRM, Session
+from failuretwin.core.errors import FailureTwinError
+from failuretwin.core.foreign import printable
+from failuretwin.digital_model.robot import Robot
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+
+T = TypeVar("T")
+
+EXPIRY_S = 5.0
+"""Time between two looks whether the session has ended [s]."""
+CHOICES = {"theme": texts.THEMES, "unit": texts.UNIT_NAMES}
+YEAR_S = 31_536_000
+COLOURS = {
+    "alarm": "#b3261e",
+    "suspected": "#8a5a00",
+    "undecided": "#6b4fa0",
+    "stale": "#5a6470",
+    "waiting": "#5a6470",
+    "healthy": "#1b6e3c",
+}
+"""Colours of states; white letters on them have a contrast of 5 to 1 or more."""
+STYLE = """
+body { --line: #c9d1d8; --soft: #f3f5f7; --link: #1f5f99; }
+body.body--dark { --line: #4a545d; --soft: #23292e; --link: #8ec5f4; }
+.page { padding: 1rem; max-width: 110rem; margin: 0 auto; width: 100%; }
+h1 { font-size: 1.5rem; line-height: 2rem; font-weight: 600; margin: 0 0 .5rem; }
+h2 { font-size: 1.1rem; line-height: 1.6rem; font-weight: 600; margin: 1rem 0 .25rem; }
+p { margin: .25rem 0; overflow-wrap: anywhere; }
+.page a { color: var(--link); text-decoration: underline; }
+table.plain { border-collapse: collapse; width: 100%; }
+table.plain th, table.plain td { text-align: left; padding: .25rem .6rem; vertical-align: top;
+  border-bottom: 1px solid var(--line); overflow-wrap: anywhere; }
+.state { color: #fff; border-radius: .3rem; padding: 0 .5rem; display: inline-block; }
+.choice { font-size: 1rem; border: 1px solid #6b757e; border-radius: .3rem; padding: .3rem .4rem;
+  background: #fff; color: #16191c; }
+.columns { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fit, minmax(20rem, 1fr)); }
+.columns > * { min-width: 0; }
+.scroll { overflow: auto; max-height: 24rem; }
+.soft { opacity: .85; font-size: .9rem; }
+:focus-visible { outline: 3px solid #d98e00; outline-offset: 2px; }
+""" + "\n".join(f".state-{name} {{ background: {colour}; }}" for name, colour in COLOURS.items())
+ZONE_COOKIE = (
+    "<script>document.cookie='zone='+Intl.DateTimeFormat().resolvedOptions().timeZone+"
+    f"';path=/;SameSite=Strict;max-age={YEAR_S}'</script>"
+)
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A page that somebody has open.
+
+    Attributes:
+        desk: What the console knows.
+        session: Who it is.
+        theme: Colours, one of `texts.THEMES`.
+        unit: Unit of angles, one of `texts.UNIT_NAMES`.
+        zone: Time zone of the browser; None: that of this computer.
+    """
+
+    desk: Desk
+    session: Session
+    theme: str
+    unit: str
+    zone: ZoneInfo | None
+
+    @classmethod
+    def of(cls, desk: Desk, session: Session, request: Request) -> Visit:
+        """Return the visit of a request; cookies that say something else count as missing."""
+        cookies = request.cookies
+        chosen = {
+            name: cookies.get(name) if cookies.get(name) in choices else next(iter(choices))
+            for name, choices in CHOICES.items()
+        }
+        return cls(desk, session, str(chosen["theme"]), str(chosen["unit"]), _zone(cookies))
+
+    def allows(self, role: str) -> bool:
+        """Return whether the person may do something, and tell if not."""
+        if self.session.may(role):
+            return True
+        ui.notify(texts.NOT_ALLOWED.format(role=role), type="negative")
+        return False
+
+    @property
+    def confirms(self) -> bool:
+        """Whether the person may change the store."""
+        return self.session.may(CONFIRM)
+
+    def time(self, at: datetime | None, seconds: bool = False) -> str:
+        """Return a time in the zone of the reader."""
+        if at is None:
+            return ""
+        return f"{at.astimezone(self.zone):%Y-%m-%d %H:%M{':%S' if seconds else ''}}"
+
+    def angle(self, value: float, robot: Robot, motor: int, relative: bool = False) -> str:
+        """Return an angle of a motor [rad], or a place of one that slides [m], in words."""
+        if robot.slides[motor]:
+            return f"{1e3 * value:.1f} mm"
+        if self.unit == "counts" and robot.profile.servo_units is not None:
+            counts = robot.servo_units.to_counts(np.array(value))
+            zero = robot.servo_units.to_counts(np.array(0.0)) if relative else 0.0
+            return f"{float(counts - zero):.0f} counts"
+        if self.unit == "rad":
+            return f"{value:.3f} rad"
+        return f"{np.rad2deg(value):.1f} deg"
+
+
+def _zone(cookies: Mapping[str, str]) -> ZoneInfo | None:
+    try:
+        return ZoneInfo(cookies["zone"])
+    except (KeyError, ValueError, OSError):
+        return None
+
+
+@contextmanager
+def page(visit: Visit, title: str) -> Iterator[None]:
+    """Draw what is around a page."""
+    ui.page_title(f"{title} - {texts.TITLE}")
+    ui.colors(primary="#1f5f99", negative="#b3261e", positive="#1b6e3c", warning="#8a5a00")
+    ui.dark_mode({"auto": None, "light": False, "dark": True}[visit.theme])
+    ui.add_css(STYLE)
+    ui.add_head_html(ZONE_COOKIE)
+    with ui.header().classes("items-center gap-4 py-2").props("elevated"):
+        with ui.element("nav").classes("flex gap-4").props('aria-label="Main"'):
+            for name, target in (
+                (texts.WALL, "/"),
+                (texts.CHECK, "/check"),
+                (texts.IMPORT, "/import"),
+            ):
+                ui.link(name, target).classes("text-white")
+        ui.space()
+        _choice(visit.theme, "theme", texts.THEME)
+        _choice(visit.unit, "unit", texts.UNITS)
+        if visit.session.name:
+            ui.label(texts.SIGNED_IN.format(name=visit.session.name, role=visit.session.role))
+            with ui.element("form").props('method="post" action="/logout"'):
+                ui.element("button").props('type="submit"').add_slot("default", texts.SIGN_OUT)
+    main = ui.element("div").classes("page")
+    ui.skip_link(texts.SKIP, target=main)
+
+    def look() -> None:
+        if not visit.session.valid:
+            ui.navigate.to("/login")
+
+    ui.timer(EXPIRY_S, look)
+    with main:
+        heading(title, 1)
+        yield
+
+
+def _choice(value: str, name: str, label: str) -> None:
+    """Draw a choice that the browser remembers in a cookie."""
+    chosen = (
+        f"document.cookie='{name}='+event.target.value+';path=/;SameSite=Strict;max-age={YEAR_S}'"
+    )
+    with ui.element("label").classes("text-white text-sm flex items-center gap-1"):
+        text(label, "span")
+        with (
+            ui.element("select")
+            .props(f'onchange="{chosen};location.reload()"')
+            .classes("text-black bg-white rounded px-1")
+        ):
+            for key, shown in CHOICES[name].items():
+                option = text(shown, "option").props(f'value="{key}"')
+                if key == value:
+                    option.props("selected")
+
+
+def text(words: str, tag: str = "p") -> ui.label:
+    """Draw text, never as markup; return its element."""
+    return _Text(printable(words), tag)
+
+
+class _Text(ui.label):
+    """A label with another tag."""
+
+    def __init__(self, words: str, tag: str) -> None:
+        super().__init__(words)
+        self.tag = tag
+
+
+def heading(words: str, level: int = 2) -> ui.label:
+    """Draw a heading."""
+    return text(words, f"h{level}")
+
+
+def state_badge(state: str) -> ui.label:
+    """Draw a state by word, sign and colour."""
+    words = f"{texts.SIGNS[state]} {texts.STATES[state]}"
+    return text(words, "span").classes(f"state state-{state}")
+
+
+class Choice:
+    """A choice that screen readers know: the select of the browser.
+
+    Attributes:
+        value: What is chosen.
+    """
+
+    def __init__(
+        self,
+        options: Sequence[str],
+        value: str,
+        label: str,
+        on_change: Callable[[], object] = lambda: None,
+    ) -> None:
+        self.value = value
+        self._options, self._on_change = options, on_change
+        with ui.element("label").classes("flex flex-col text-sm"):
+            text(label, "span")
+            chosen = ui.element("select").classes("choice")
+            chosen.on("change", self._choose, js_handler="(e) => emit(e.target.selectedIndex)")
+            with chosen:
+                for one in options:
+                    option = text(one, "option")
+                    if one == value:
+                        option.props("selected")
+
+    def _choose(self, event: events.GenericEventArguments) -> None:
+        if isinstance(event.args, int) and 0 <= event.args < len(self._options):
+            self.value = self._options[event.args]
+            self._on_change()
+
+
+Cell = str | Callable[[], object]
+"""Cell of a table: text, or what draws it."""
+
+
+def table(headings: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
+    """Draw a table; cells are texts, or draw themselves."""
+    with ui.element("div").classes("scroll").props('tabindex="0" role="region"') as region:
+        region.props(f'aria-label="{headings[0]}"')
+        with ui.element("table").classes("plain"):
+            with ui.element("thead"), ui.element("tr"):
+                for one in headings:
+                    text(one, "th").props('scope="col"')
+            with ui.element("tbody"):
+                for row in rows:
+                    with ui.element("tr"):
+                        for cell in row:
+                            if isinstance(cell, str):
+                                text(cell, "td")
+                            else:
+                                with ui.element("td"):
+                                    cell()
+
+
+def link_to(page_name: str, **query: object) -> str:
+    """Return the address of a page of a robot."""
+    told = "&".join(f"{name}={quote(str(value), safe='')}" for name, value in query.items())
+    return f"/{page_name}?{told}"
+
+
+async def worked(work: Callable[..., T], *values: object) -> T | None:
+    """Do work in a thread; tell what is wrong and return None if it cannot be done."""
+    try:
+        return await run.io_bound(work, *values)
+    except FailureTwinError as error:
+        ui.notify(printable(str(error)), type="negative", multi_line=True, timeout=15_000)
+        return None
+
+
+def button(words: str, press: Callable[[], object] | Callable[[], Awaitable[object]]) -> ui.button:
+    """Draw a button."""
+    return ui.button(words, on_click=press).props("no-caps dense").classes("px-3")

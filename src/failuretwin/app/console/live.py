@@ -1,0 +1,216 @@
+"""Robots that are watched while the console is open, each in a thread."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from threading import Event, Thread
+
+import numpy as np
+
+from failuretwin.app.console import state as shown
+from failuretwin.app.console import texts
+from failuretwin.app.console.state import LiveView, Sample, Tile, Trace
+from failuretwin.app.live import troubles_of
+from failuretwin.app.shadow import Changes, Shadow
+from failuretwin.app.watch_keeper import WatchKeeper
+from failuretwin.connection.links.base import OK, Answer, Item, Sink, Source
+from failuretwin.connection.links.statuses import UNDECIDED, statuses
+from failuretwin.core.errors import FailureTwinError
+from failuretwin.core.foreign import printable
+from failuretwin.decision.streaming.fleet import MOVEMENTS, SILENCE_S
+from failuretwin.decision.streaming.monitor import FaultMonitor
+from failuretwin.decision.streaming.set_up_watch import PROOF
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+
+KEPT_S = 600.0
+"""Time of a live robot that can be replayed [s]."""
+KEPT = 6000
+"""Readings that are kept at most: `KEPT_S` at 10 Hz."""
+POSTERIOR_S = 1.0
+"""Time between two kept posteriors [s]."""
+SHOWN_CHANGES = 8
+POLL_S = 0.1
+
+STATES = {
+    "OK": shown.HEALTHY,
+    "SUSPECTED": shown.SUSPECTED,
+    "ALARM": shown.ALARM,
+    UNDECIDED: shown.UNDECIDED,
+    "STALE": shown.STALE,
+}
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """What watches one robot.
+
+    Attributes:
+        name: Name of the robot.
+        known: The robot, calibrated.
+        monitor: The diagnoser.
+        open_source: Opens its source on a stack.
+        wait_s: Longest delay of commands [s].
+        faults: Faults of an emulated arm, which its emulated check has too.
+        place: Network of the real arm; empty: emulated or a log.
+    """
+
+    name: str
+    known: CalibratedRobot
+    monitor: FaultMonitor
+    open_source: Callable[[ExitStack], Source]
+    wait_s: float = 0.0
+    faults: tuple[str, ...] = ()
+    place: str = ""
+
+
+class LiveRobot(Sink):
+    """Watches one robot in a thread; other threads read `view` and `trace`.
+
+    Args:
+        settings: The robot and its source.
+        begin_keeping: Begins to store changes; None: they are not stored.
+    """
+
+    trouble = ""
+
+    def __init__(
+        self, settings: LiveSettings, begin_keeping: Callable[[], WatchKeeper] | None = None
+    ) -> None:
+        self.settings = settings
+        self._begin_keeping = begin_keeping
+        self._samples: deque[Sample] = deque(maxlen=KEPT)
+        self._posterior: deque[tuple[float, Mapping[str, float]]] = deque(
+            maxlen=round(KEPT_S / POSTERIOR_S)
+        )
+        self._starts: deque[float] = deque(maxlen=MOVEMENTS)
+        self._begun = 0
+        self._heard: datetime | None = None
+        self._stopped = Event()
+        motors = settings.known.robot.motor_names
+        self._changes = Changes(motors)
+        empty = Answer(0.0, "STALE", None)
+        tile = Tile(settings.name, settings.known.robot.name, shown.WAITING, "", texts.NEVER, None)
+        now = tuple(statuses(empty, motors))
+        self.view = LiveView(tile, 0.0, None, now, None, empty.alarm, ())
+        self._thread = Thread(target=self._run, name=f"watch {settings.name}", daemon=True)
+
+    def start(self) -> None:
+        """Begin to watch."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the watch."""
+        self._stopped.set()
+
+    def trace(self) -> Trace:
+        """Return the motion of the last minutes."""
+        while True:
+            try:
+                samples, posterior = list(self._samples), tuple(self._posterior)
+                break
+            except RuntimeError:  # the other thread has just added one
+                continue
+        known = [one for one in samples if one.command is not None]
+        motors = len(self.settings.known.robot.motors)
+        return Trace(
+            self.settings.name,
+            np.array([one.time for one in known]),
+            np.array([one.command for one in known]).reshape(-1, motors),
+            np.array([one.tool for one in known]).reshape(-1, 3),
+            np.array(list(self._starts)),
+            self.view.diagnosis,
+            posterior,
+            self._begun - len(self._starts) + 1,
+        )
+
+    def put(self, item: Item) -> None:
+        """Take what passes the shadow; its answers are read from the shadow itself."""
+
+    def _run(self) -> None:
+        try:
+            with ExitStack() as stack:
+                self._watch(self.settings.open_source(stack))
+        except FailureTwinError as error:
+            self._end(str(error))
+
+    def _watch(self, source: Source) -> None:
+        own = self.settings
+        shadow = Shadow(source, own.monitor, own.known.twin, [self], own.wait_s)
+        keeper = None if self._begin_keeping is None else self._begin_keeping()
+        begun_s, going = time.monotonic(), True
+        while going and not self._stopped.is_set():
+            going = shadow.step(POLL_S)
+            troubles = troubles_of(shadow, time.monotonic() - begun_s)
+            if keeper is not None and keeper.trouble:
+                troubles += (keeper.trouble,)
+            counts, jumps = shadow.counts, shadow.clock.jumps
+            changes = self._changes.notice(shadow.snapshot, counts, jumps, troubles)
+            if keeper is not None:
+                keeper.keep(changes, shadow.snapshot.answer)
+            self._remember(shadow)
+        if keeper is not None:
+            keeper.end(shadow.snapshot, decided=own.monitor.fit.seen > PROOF)
+        self._end("")
+
+    def _remember(self, shadow: Shadow) -> None:
+        """Take over the state of the shadow."""
+        snapshot = shadow.snapshot
+        answer, at = snapshot.answer, snapshot.stream_time
+        command = self._reference(shadow, at)
+        read, last = snapshot.residual, self.view.sample
+        if command is not None and np.isfinite(read).all() and (last is None or at > last.time):
+            tool = shadow.twin.path(command) + read
+            last = Sample(at, time.time(), command, tool)
+            self._samples.append(last)
+            self._heard = datetime.now(UTC)
+        diagnosis = answer.diagnosis
+        due = not self._posterior or at >= self._posterior[-1][0] + POSTERIOR_S
+        if due and answer.state == OK and diagnosis is not None and not diagnosis.undecided:
+            self._posterior.append((at, diagnosis.posterior))
+        now = tuple(statuses(answer, self.settings.known.robot.motor_names))
+        changes = tuple(list(self._changes.lines)[-SHOWN_CHANGES:])
+        self.view = LiveView(
+            self._tile(shadow, now[0].state, now[0].message),
+            at,
+            last,
+            now,
+            diagnosis,
+            answer.alarm,
+            changes,
+        )
+
+    def _reference(self, shadow: Shadow, at: float) -> np.ndarray | None:
+        """Return the reference of the motors at a time of the stream [s]; note new movements."""
+        ramp = shadow.reference.ramp
+        if ramp is None:
+            return None
+        if np.isfinite(ramp.start) and (not self._starts or ramp.start > self._starts[-1]):
+            self._starts.append(float(ramp.start))
+            self._begun += 1
+        return np.asarray(ramp.at(at))
+
+    def _tile(self, shadow: Shadow, word: str, message: str) -> Tile:
+        own, alarm = self.settings, shadow.snapshot.answer.alarm
+        state, said = STATES[word], message
+        waiting = shadow.snapshot.answer.diagnosis is None
+        if waiting and self._heard is not None and word == "STALE":
+            silent = (datetime.now(UTC) - self._heard).total_seconds() > SILENCE_S
+            state = shown.STALE if silent else shown.WAITING
+        set_up = own.monitor.set_up
+        if set_up and state == shown.HEALTHY:
+            state, said = shown.UNDECIDED, texts.SET_UP.format(finding=set_up)
+        mode = shown.modes_of([alarm.cause]) if alarm.cause else ""
+        return Tile(own.name, own.known.robot.name, state, mode, printable(said), self._heard)
+
+    def _end(self, why: str) -> None:
+        """Show the robot as stale, with its last word."""
+        tile = self.view.tile
+        said = why or tile.said
+        if not why and tile.state != shown.STALE:
+            said = texts.LAST_WORD.format(said=tile.said)
+        self.view = replace(self.view, tile=replace(tile, state=shown.STALE, said=printable(said)))

@@ -1,0 +1,246 @@
+"""What the console shows, as values: tiles of robots, live views, traces of runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+
+from failuretwin.app.console import texts
+from failuretwin.app.shadow import Change
+from failuretwin.connection.links.statuses import Status
+from failuretwin.core.foreign import printable
+from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, Alarm, Diagnosis, Hypothesis
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.data_knowledge.records import CHECK_DAYS
+from failuretwin.data_knowledge.records.overview import RobotGlance
+from failuretwin.digital_model.inverse_kinematics import InverseKinematics
+
+ALARM, SUSPECTED, UNDECIDED, STALE, WAITING, HEALTHY = texts.STATES
+WORST_FIRST = (ALARM, SUSPECTED, UNDECIDED, STALE, WAITING, HEALTHY)
+SUSPECT = 0.05
+"""Probability from which the drawn arm lets a motor differ from its command."""
+LONGEST_TEXT = 300
+"""Length to which texts from logs are cut [letters]."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A robot on the wall.
+
+    Attributes:
+        name: Its name.
+        kind: Name of its profile; empty: not known.
+        site: The part of its name before the first dash; empty: none.
+        state: One of `WORST_FIRST`.
+        mode: Fault modes that are named, joined by commas.
+        said: The state in words.
+        heard: When it was last heard (UTC); None: never.
+    """
+
+    name: str
+    kind: str
+    state: str
+    mode: str
+    said: str
+    heard: datetime | None
+
+    @property
+    def site(self) -> str:
+        """The part of its name before the first dash; empty: none."""
+        head, dash, _ = self.name.partition("-")
+        return head if dash else ""
+
+    def record(self) -> dict[str, Any]:
+        """Return it for the page."""
+        return {
+            "name": self.name,
+            "kind": self.kind,
+            "site": self.site,
+            "state": self.state,
+            "rank": WORST_FIRST.index(self.state),
+            "mode": self.mode,
+            "said": printable(self.said)[:LONGEST_TEXT],
+            "heard": self.heard.timestamp() * 1000.0 if self.heard else None,
+        }
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A reading of a live robot.
+
+    Attributes:
+        time: Time of the stream [s].
+        read: When it came [s since 1970].
+        command: Reference of the motors, (motor,) [rad]; None: not known.
+        tool: Position of the tool, (axis,) [m].
+    """
+
+    time: float
+    read: float
+    command: FloatArray | None
+    tool: FloatArray
+
+
+@dataclass(frozen=True)
+class LiveView:
+    """State of a live robot.
+
+    Attributes:
+        tile: It on the wall.
+        stream_time: Time of the stream [s].
+        sample: The last reading; None: none yet.
+        statuses: Status of the arm, then of each motor.
+        diagnosis: The diagnosis; None: none yet.
+        alarm: The alarm.
+        changes: The last changes, the newest last.
+    """
+
+    tile: Tile
+    stream_time: float
+    sample: Sample | None
+    statuses: Sequence[Status]
+    diagnosis: Diagnosis | None
+    alarm: Alarm
+    changes: Sequence[Change]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Motion of a run, or of the last minutes of a live robot.
+
+    Attributes:
+        name: Name of the run.
+        time: (sample,) [s].
+        command: References of the motors, (sample, motor) [rad].
+        measured: Tool positions, (sample, axis) [m]; NaN: no reading.
+        movements: Starts of movements, (movement,) [s].
+        diagnosis: Diagnosis of it; None: none.
+        posterior: Times [s] and probabilities of hypotheses; empty: not followed over time.
+        first: Number of the first of the movements.
+    """
+
+    name: str
+    time: FloatArray
+    command: FloatArray
+    measured: FloatArray
+    movements: FloatArray
+    diagnosis: Diagnosis | None
+    posterior: Sequence[tuple[float, Mapping[str, float]]] = ()
+    first: int = 1
+
+
+def worst_first(tiles: Sequence[Tile]) -> list[Tile]:
+    """Return tiles by health, then by name."""
+    return sorted(tiles, key=lambda tile: (WORST_FIRST.index(tile.state), tile.name))
+
+
+def modes_of(names: Sequence[str]) -> str:
+    """Return the fault modes in hypotheses, joined by commas."""
+    found = {fault.mode for name in names if name for fault in Hypothesis.parse(name).faults}
+    return ", ".join(sorted(found))
+
+
+def stored_tile(glance: RobotGlance, now: datetime) -> Tile:
+    """Return a robot of the store. A robot without a run for `CHECK_DAYS` is stale."""
+    said = "; ".join(
+        f"{name.replace(':', ': ')}{' (confirmed)' if confirmed else ''}"
+        for name, confirmed in glance.faults.items()
+    )
+    said = said or glance.verdict
+    mode = modes_of(list(glance.faults))
+    if glance.at is None:
+        return Tile(glance.robot, glance.kind, WAITING, mode, texts.NEVER, None)
+    silent = now - glance.at > timedelta(days=CHECK_DAYS)
+    state = ALARM if glance.faults else _STATES.get(glance.state, UNDECIDED)
+    if silent:
+        state, said = STALE, texts.LAST_WORD.format(said=said)
+    return Tile(glance.robot, glance.kind, state, mode, said, glance.at)
+
+
+_STATES = {HEALTHY_STATE: HEALTHY, FAULTY_STATE: ALARM}
+
+FLEET_STATES = {
+    "alarm": ALARM,
+    "suspected": SUSPECTED,
+    "undecided": UNDECIDED,
+    "STALE": STALE,
+    "stale": STALE,
+    "waiting": WAITING,
+    "clear": HEALTHY,
+}
+REPORT_S = 30.0
+"""Age of a report of a worker from which its robots are stale [s]."""
+
+
+def fleet_tiles(status: Mapping[str, Any], kinds: Mapping[str, str], now_s: float) -> list[Tile]:
+    """Return the robots of a fleet, by what its workers have reported.
+
+    Args:
+        status: What `app.fleet.read_status` returns.
+        kinds: Profile of each robot, where known.
+        now_s: Now [s since 1970].
+    """
+    tiles = []
+    for part in status["partitions"].values():
+        late = now_s - part["at"] > REPORT_S
+        for name, one in part["robots"].items():
+            state = STALE if late else FLEET_STATES.get(one["state"], UNDECIDED)
+            cause = str(one["cause"])
+            said = cause or texts.STATES[FLEET_STATES.get(one["state"], UNDECIDED)]
+            mode = modes_of([cause]) if ":" in cause and " " not in cause else ""
+            if state == STALE:
+                said = texts.LAST_WORD.format(said=said)
+            heard = datetime.fromtimestamp(one["heard"], UTC) if one["heard"] > 0 else None
+            tiles.append(Tile(name, kinds.get(name, ""), state, mode, said, heard))
+    return tiles
+
+
+# Poses that are drawn.
+
+
+def suspected_motors(motors: Sequence[str], diagnosis: Diagnosis | None) -> BoolArray:
+    """Return the motors whose fault is at least as probable as `SUSPECT`."""
+    found = motor_shares(motors, diagnosis)
+    return np.array([found[motor] >= SUSPECT for motor in motors])
+
+
+def motor_shares(motors: Sequence[str], diagnosis: Diagnosis | None) -> dict[str, float]:
+    """Return the probability of a fault of each motor."""
+    shares = dict.fromkeys(motors, 0.0)
+    if diagnosis is None or diagnosis.undecided:
+        return shares
+    for name, probability in diagnosis.posterior.items():
+        for fault in Hypothesis.parse(name).faults:
+            if fault.motor in shares:
+                shares[fault.motor] = min(1.0, shares[fault.motor] + probability)
+    return shares
+
+
+def seen_pose(
+    arm: InverseKinematics, command: FloatArray, tool: FloatArray, suspects: BoolArray
+) -> FloatArray:
+    """Return the pose nearest to a command that brings the tool to where it is, (motor,) [rad].
+
+    Only suspected motors differ from the command, if there are any.
+    """
+    if not np.isfinite(tool).all():
+        return command
+    locked = ~suspects if suspects.any() else None
+    return np.asarray(arm.solve(tool[None], command[None], locked).pose[0, 0])
+
+
+def residuals(arm: InverseKinematics, command: FloatArray, tool: FloatArray) -> FloatArray:
+    """Return what remains of the tool error if one motor differs from its command [m].
+
+    r_k = min over q_k of |tool - path(q)|, all other motors at their command; the last column is
+    the error with all of them there. Commands are (sample, motor) [rad], the result is (sample,
+    motor + 1).
+    """
+    motors = command.shape[-1]
+    alone = [arm.solve(tool, command[:, None], np.arange(motors) != k) for k in range(motors)]
+    error = np.linalg.norm(tool - arm.tool(command)[0], axis=-1)
+    return np.column_stack([*(one.miss_m[:, 0] for one in alone), error])

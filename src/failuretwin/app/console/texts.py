@@ -1,0 +1,123 @@
+"""All texts of the console."""
+
+from __future__ import annotations
+
+TITLE = "failuretwin console"
+WALL, HISTORY, CHECK, IMPORT, ROBOT, REPLAY = (
+    "Robots",
+    "History",
+    "Check",
+    "Import a log",
+    "Robot",
+    "Replay",
+)
+SKIP = "Skip to content"
+THEME, UNITS = "Colours", "Angles in"
+THEMES = {"auto": "as the system", "light": "light", "dark": "dark"}
+UNIT_NAMES = {"deg": "degrees", "rad": "radians", "counts": "servo counts"}
+SIGNED_IN, SIGN_OUT = "signed in as {name} ({role})", "Sign out"
+NOT_ALLOWED = "This needs the role {role}. Ask who runs the console."
+EXPIRED = "Your session has ended. Sign in again."
+NO_STORE = "No store is open. Start the console with --store."
+NO_ROBOT = "No robot of this name is known here."
+NO_PROFILE = "The profile of this robot is not known here, so its arm is not drawn."
+
+STATES = {
+    "alarm": "alarm",
+    "suspected": "suspected",
+    "undecided": "undecided",
+    "stale": "stale",
+    "waiting": "no verdict yet",
+    "healthy": "healthy",
+}
+SIGNS = {
+    "alarm": "✕",
+    "suspected": "!",
+    "undecided": "?",
+    "stale": "=",
+    "waiting": "…",
+    "healthy": "✓",
+}
+LAST_WORD = "last word: {said}"
+NEVER = "nothing was heard yet"
+SET_UP = "the set-up is uncertain: {finding}"
+
+WALL_TEXTS = {
+    "search": "Search",
+    "kind": "Kind",
+    "site": "Site",
+    "mode": "Fault mode",
+    "state": "State",
+    "all": "all",
+    "none": "No robot matches.",
+    "heard": "heard",
+    "shown": "of",
+    "robots": "robots",
+    "states": STATES,
+    "signs": SIGNS,
+}
+
+VERDICT, SINCE, HOW_SURE, WHY, NEXT = "Verdict", "Since", "How sure", "Why", "What to do now"
+ALARM_SINCE = "{time}, alarm number {number}"
+MOVEMENT_BUTTON = "Movement {number}: {nats:+.1f} nats"
+MOTORS, MOTOR, STATE, PROBABILITY, SAYS = "Motors", "Motor", "State", "Fault probability", "Says"
+ARM = "Arm: solid where it is, transparent where it was told to be"
+ARM_NOTE = "The solid arm is drawn from the measured tool and the suspected motor."
+POSTERIOR, RESIDUALS, TOOL = "Probability over time", "Residuals by motor", "Tool path"
+RESIDUAL_NOTE = "What remains of the tool error if only this motor differs from its command."
+TOTAL = "tool error"
+ANGLES, TOLD, DRAWN = "Angles", "Told", "Drawn"
+COMMANDED, MEASURED = "commanded", "measured"
+BLIND, ASK_BLIND = "What the motion could not show", "Work it out"
+REACH, ASK_REACH = "What it can still reach", "Show in the scene"
+REACHED = "{share:.0%} of the usual workspace with {motor} held at {angle}"
+ALL_REACHED = "{share:.0%} of the usual workspace"
+LIFE, ASK_LIFE = "Remaining life", "Estimate"
+LIFE_NOTE = "How real arms wear is not known; shapes and limit are assumed."
+CHANGES, REPLAY_LIVE = "What changed", "Replay the last minutes"
+READ_AT = "reading of {time}"
+STREAM_TIME = "{time:.1f} s"
+WORKING, NOTHING = "Working ...", "nothing"
+
+RUNS, WHEN, RUN, PLAY = "Runs", "When", "Run", "Replay"
+NO_LOG = "its log is not on this computer"
+SLIDER = "Time in the run"
+REPORT = "Page for technicians"
+PAUSE = "Pause"
+
+EPISODES, EPISODE, FAULT, FINDING = "Fault episodes", "Episode", "Fault", "Finding"
+TIMELINE, EVENT = "Timeline", "Event"
+YOUR_NAME, NOTE, CAUSE, PART = "Your name", "Note", "Cause", "Part"
+CONFIRM, REJECT, OTHER, UNDO = "Confirm", "Reject", "Other cause", "Undo"
+NOTE_REPAIR, REPAIR, UNDO_REPAIR = "Note a repair", "Repair", "Undo its last repair"
+RATES = "Learned rates of faults"
+RATE_COLUMNS = ("Fault", "Confirmed", "Times the assumed rate")
+COMPARE, THEN, NOW = "Compare two dates", "Then", "Now"
+OFFSET, CHANGE = "Offset", "Change"
+NO_OFFSETS = "No offsets are stored. `check` and `diagnose --track` store them."
+STORED = "stored"
+
+CHECK_NOTE = "Test movements on {place}, behind the same gates as `failuretwin check`."
+EMULATED_ARM, REAL_ARM = "an emulated arm", "the real arm at {place}"
+NO_MOVE = "The real arm is not moved: the server was started without --move."
+SECONDS, START, STOP = "Seconds", "Start the check", "STOP"
+STOP_NOTE = "No emergency stop: keep the real one in reach. It works from any window: /stop"
+STOPPED_BY = "stopped by {name}"
+STOP_SENT, NO_CHECK = "Told to stop.", "No check is running."
+HANG = "the console hangs"
+GONE = "the page that started the check is gone"
+BUSY = "A check is running. Wait for it, or stop it."
+STARTED, FINISHED = "the check of {robot} has begun", "the check is over"
+
+DROP = "Drop a log here, or choose one (.nc, .csv, .mat, .bag, .mcap)"
+DROP_LABEL = "Log file"
+REFUSED = "refused: {why}"
+TOO_LARGE = "larger than {limit} MB"
+ROBOT_NAME, PROFILE = "Name of the robot in the store", "Profile"
+NOT_STORED = "Diagnosed, not stored: no robot was named, no store is open, or your role is `see`."
+
+LOGIN, NAME, PASSWORD, SIGN_IN = "Sign in", "Name", "Password", "Sign in"
+WRONG = "Name or password is wrong."
+TOO_OFTEN = "Too many tries. Wait a minute."
+FOREIGN = "refused: the request comes from another site, or names another host"
+FLOOD = "refused: too many events"

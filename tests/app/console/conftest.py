@@ -1,0 +1,19 @@
+from __future__ import annotations
+
+import pytest
+
+from console_server import ConsoleServer, open_browser
+
+
+@pytest.fixture(scope="session")
+def browser():
+    made = open_browser()
+    yield made
+    made.quit()
+
+
+@pytest.fixture(scope="session")
+def server(browser, tmp_path_factory):
+    made = ConsoleServer(tmp_path_factory.mktemp("console"))
+    yield made
+    made.stop()

@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+
+pytest.importorskip("nicegui")
+
+from failuretwin.app.console import act, guard, state
+from failuretwin.app.console.checking import HANGS_S, Stoppable, beat_watch
+from failuretwin.connection.links.base import Order, Reading
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.data_knowledge.records.overview import RobotGlance
+from failuretwin.decision.acting.work import Halted
+from failuretwin.digital_model.inverse_kinematics import InverseKinematics
+
+NOW = datetime(2026, 3, 1, tzinfo=UTC)
+
+
+def glance(days=1.0, verdict_state="healthy", faults=None):
+    at = None if days is None else NOW - timedelta(days=days)
+    return RobotGlance("hall-arm", "armpi_fpv", at, verdict_state, "said", faults or {})
+
+
+@pytest.mark.parametrize(
+    ("one", "expected"),
+    [
+        (glance(), state.HEALTHY),
+        (glance(faults={"motor_3:stuck": True}), state.ALARM),
+        (glance(verdict_state="cannot tell"), state.UNDECIDED),
+        (glance(days=31.0), state.STALE),
+        (glance(days=31.0, faults={"motor_3:stuck": False}), state.STALE),
+        (glance(days=None), state.WAITING),
+    ],
+)
+def test_the_state_of_a_stored_robot(one, expected):
+    tile = state.stored_tile(one, NOW)
+    assert (tile.state, tile.site) == (expected, "hall")
+
+
+def test_the_worst_robot_comes_first():
+    tiles = [state.Tile(s, "", s, "", "", None) for s in reversed(state.WORST_FIRST)]
+    assert [t.state for t in state.worst_first(tiles)] == list(state.WORST_FIRST)
+
+
+def test_a_fleet_whose_worker_is_silent_is_stale():
+    robot = {"state": "clear", "cause": "", "heard": 100.0}
+    status = {"partitions": {"p1": {"at": 100.0, "robots": {"a": robot}}}}
+    (fresh,), (late,) = (state.fleet_tiles(status, {}, now) for now in (101.0, 200.0))
+    assert (fresh.state, late.state) == (state.HEALTHY, state.STALE)
+    assert late.said == "last word: healthy"
+
+
+def test_only_the_suspected_motor_of_the_drawn_arm_differs(armpi):
+    arm = InverseKinematics.of(armpi)
+    command = np.array([0.3, 0.4, -0.5, 0.6])
+    true = command + np.array([0.0, 0.0, 0.35, 0.0])
+    tool = arm.tool(true[None])[0][0]
+    suspect = state.suspected_motors(
+        armpi.motor_names, Diagnosis("", {"healthy": 0.1, "motor_3:stuck": 0.9})
+    )
+    assert state.seen_pose(arm, command, tool, suspect) == pytest.approx(true, abs=1e-4)
+    left = state.residuals(arm, command[None], tool[None])[0]
+    assert np.argmin(left) == 2
+    assert left[2] < 1e-5
+    assert left[-1] == pytest.approx(np.linalg.norm(tool - arm.tool(command[None])[0][0]))
+
+
+def test_passwords_are_salted_and_files_of_users_are_checked(tmp_path):
+    path = tmp_path / "users.toml"
+    guard.add_user(path, "ada", "move", "secret")
+    guard.add_user(path, "bob", "see", "secret")
+    users = guard.load_users(path)
+    assert users["ada"].password != users["bob"].password
+    assert path.stat().st_mode & 0o077 == 0
+    sessions = guard.Sessions(users)
+    token = sessions.sign_in("ada", "secret")
+    assert sessions.of(token).may("confirm")
+    assert sessions.sign_in("ada", "Secret") == ""
+    path.write_text('[ada]\nrole = "king"\npassword = "scrypt:00:00"\n')
+    with pytest.raises(InputError, match="role"):
+        guard.load_users(path)
+
+
+def test_sessions_expire(tmp_path, monkeypatch):
+    users = {"ada": guard.User("ada", "see", guard.hashed("secret"))}
+    sessions = guard.Sessions(users)
+    session = sessions.of(sessions.sign_in("ada", "secret"))
+    assert not session.may("confirm")
+    session.seen_s -= guard.SESSION_S + 1.0
+    assert not session.may("see")
+
+
+@pytest.mark.parametrize("name", ["../../x.csv", "a/b\\c.csv", "<b>.csv", ".csv", "x\x00.csv"])
+def test_a_log_lies_in_our_folder_whatever_its_name(tmp_path, name):
+    placed = act._placed(tmp_path, name, b"x")
+    assert isinstance(placed, str) or placed.path.parent.parent == tmp_path
+
+
+@pytest.mark.parametrize("name", ["x.exe", "x.html", "x", "x.csv.svg"])
+def test_other_files_are_refused(tmp_path, name):
+    assert act._placed(tmp_path, name, b"x").startswith("refused: ")
+
+
+class FakeArm:
+    name, ended, counts, standing = "fake", False, None, np.zeros(2)
+
+    def __init__(self):
+        self.sent = []
+
+    def poll(self, timeout_s):
+        return Reading(0.0, position=np.array([0.1, 0.2]))
+
+    def send(self, order):
+        self.sent.append(order)
+
+
+def test_a_stopped_arm_is_told_to_stay_where_it_was_read():
+    arm, why = FakeArm(), []
+    stoppable = Stoppable(arm, lambda: why[0] if why else "")
+    stoppable.poll(0.1)
+    stoppable.send(Order(np.ones(2), np.ones(2)))
+    why.append("stopped by ada")
+    for use in (lambda: stoppable.poll(0.1), lambda: stoppable.send(arm.sent[0])):
+        with pytest.raises(Halted, match="stopped by ada"):
+            use()
+        assert arm.sent[-1].target.tolist() == [0.1, 0.2]
+
+
+def test_a_check_stops_by_itself_if_the_console_hangs_or_its_page_is_gone():
+    import time
+
+    now = time.monotonic()
+    assert beat_watch(lambda: now, lambda: True)() == ""
+    assert "hangs" in beat_watch(lambda: now - HANGS_S - 1.0, lambda: True)()
+    assert "gone" in beat_watch(lambda: now, lambda: False)()

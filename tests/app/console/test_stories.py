@@ -1,0 +1,262 @@
+"""What people do with the console, by what they see and click, in a real browser.
+
+The stories are told in their order, on one server and in one browser.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+import urllib.parse
+import urllib.request
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+import failuretwin as ft
+from console_server import PASSWORD
+
+pytest.importorskip("selenium", reason="selenium is not installed")
+from selenium.common.exceptions import WebDriverException
+
+SICK, LIVE, SILENT = "hall_2-arm_7", "hall_1-arm_2", "hall_1-arm_3"
+PICTURES = os.environ.get("FAILURETWIN_PICTURES")
+"""Folder for the pictures of README and docs; empty: none are taken."""
+LONGEST_S = 60.0
+
+
+class Person:
+    """Somebody at the browser."""
+
+    def __init__(self, browser, url):
+        self.browser, self.url = browser, url
+
+    def go(self, page):
+        self.browser.get(self.url + page)
+
+    def find(self, xpath):
+        """Return what is found, once it is there."""
+        deadline = time.monotonic() + LONGEST_S
+        while not (found := self.browser.find_elements("xpath", xpath)):
+            assert time.monotonic() < deadline, f"{xpath} is not there: {self.text[:2000]}"
+            time.sleep(0.1)
+        return found[0]
+
+    def click(self, words):
+        """Click a link or button with some words."""
+        said = f"[normalize-space()='{words}' or @aria-label='{words}']"
+
+        def clicked():
+            target = self.find(f"//a{said}|//button{said}")
+            self.browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", target)
+            target.click()
+            return True
+
+        self.waits(clicked)
+
+    def write(self, label, words):
+        field = self.find(f"//input[@aria-label='{label}' or @name='{label}']")
+        field.clear()
+        field.send_keys(words)
+
+    @property
+    def text(self):
+        return self.browser.find_element("tag name", "body").text
+
+    def sees(self, *words):
+        """Wait until words are there."""
+        self.waits(lambda: all(one in self.text for one in words), words)
+
+    def waits(self, truth, words=""):
+        """Wait until something holds; a page may be drawn anew meanwhile."""
+        deadline = time.monotonic() + LONGEST_S
+        while True:
+            with suppress(WebDriverException):
+                if truth():
+                    return
+            assert time.monotonic() < deadline, f"{words} in vain: {self.text[:2000]}"
+            time.sleep(0.1)
+
+    def sign_in(self, name, password):
+        self.go("/login")
+        self.write("name", name)
+        self.write("password", password)
+        self.click("Sign in")
+
+    def picture(self, name):
+        if PICTURES:
+            time.sleep(1.0)
+            self.browser.save_screenshot(str(Path(PICTURES) / f"{name}.png"))
+
+
+@pytest.fixture(scope="module")
+def person(browser, server):
+    return Person(browser, server.url)
+
+
+def rate_of(person, fault):
+    row = person.find(f"//tr[td[normalize-space()='{fault}']]")
+    return float(row.find_elements("tag name", "td")[2].text)
+
+
+def test_a_wrong_password_lets_nobody_in(person):
+    person.sign_in("ada", "wrong")
+    person.sees("Name or password is wrong.")
+    person.go("/robot?name=" + SICK)
+    person.sees("Password")
+    assert SICK not in person.text
+
+
+def test_the_right_one_shows_the_wall_with_the_sick_robot_first(person):
+    person.sign_in("ada", PASSWORD)
+    person.sees(SICK, "motor_3: stuck", "signed in as ada (move)")
+    first = person.find("//ul[@class='wall']/li[1]").text
+    assert SICK in first
+    assert "alarm" in first
+
+
+def test_the_wall_is_searched_and_filtered(person):
+    person.write("search", "arm_7")
+    person.sees("1 of ")
+    person.write("search", "nobody")
+    person.sees("No robot matches.")
+    person.go("/")
+
+
+def test_why_a_stored_robot_is_sick_and_the_moment_replayed(person):
+    person.sees(SICK)
+    person.find(f"//a[strong[text()='{SICK}']]").click()
+    person.sees("What to do now", "Cut the power", "motor 3 stuck")
+    person.find("//tr[td[normalize-space()='tuesday']]//a").click()
+    person.sees("Movement 4:", "possible causes")
+    person.find("//button[contains(., 'Movement 4:')]").click()
+    person.waits(lambda: float(person.find("//p[@role='status']").text.split()[0]) > 3.0)
+    person.find("//canvas")
+    person.picture("console_replay")
+
+
+def test_a_confirmation_changes_the_learned_rate_and_is_undone(person):
+    person.go(f"/history?name={SICK}")
+    before = rate_of(person, "motor_3:stuck")
+    person.write("Note", "<b>teeth</b> are gone")
+    person.click("Confirm: episode 1")
+    person.sees("confirmed, <b>teeth</b> are gone, ada")
+    person.waits(lambda: rate_of(person, "motor_3:stuck") > before)
+    person.picture("console_history")
+    person.click("Undo: episode 1")
+    person.sees("finding 'confirmed' withdrawn")
+    person.waits(lambda: rate_of(person, "motor_3:stuck") == before)
+    person.click("Reject: episode 1")
+    person.sees("wrong, ada")
+    person.click("Undo: episode 1")
+    person.write("Cause", "a loose belt")
+    person.click("Other cause: episode 1")
+    person.sees("other cause, a loose belt")
+    person.click("Undo: episode 1")
+    person.sees("finding 'other cause' withdrawn")
+
+
+def test_a_repair_is_noted_and_undone(person):
+    person.write("Part", "gear 7")
+    person.click("Repair")
+    person.sees("gear 7 replaced")
+    person.click("Undo its last repair")
+    person.waits(lambda: "gear 7 replaced" not in person.text)
+
+
+def test_a_silent_robot_is_stale_with_its_last_word(person):
+    person.go("/")
+    person.find(f"//a[strong[text()='{SILENT}'] and contains(@class, 'edge-stale')]")
+    assert "last word: " in person.find(f"//a[strong[text()='{SILENT}']]").text
+
+
+def test_a_fault_arrives_live(person):
+    person.go("/")
+    person.find(f"//a[strong[text()='{LIVE}'] and contains(@class, 'edge-alarm')]")
+    person.picture("console_wall")
+    person.find(f"//a[strong[text()='{LIVE}']]").click()
+    person.sees("motor 3 stuck", "alarm number 1", "Probability over time", "Movement ")
+    person.picture("console_robot")
+    person.find("//button[starts-with(normalize-space(), 'Movement ')]").click()
+    person.sees("Replay: ", "Angles")
+
+
+def test_a_log_is_imported(person):
+    person.go("/import")
+    person.find("//input[@type='file']").send_keys(str(ft.sample_log()))
+    person.sees("motor 3 stuck at -7 deg", "Page for technicians")
+    page = person.find("//a[normalize-space()='Page for technicians']").get_attribute("href")
+    person.browser.get(page)
+    person.sees("motor 3")
+
+
+def test_a_check_is_run_and_stopped_while_the_page_hangs(person, server):
+    person.go(f"/check?name={LIVE}")
+    person.click("Start the check")
+    person.sees(f"the check of {LIVE} has begun")
+    session = person.browser.get_cookie("failuretwin_session")["value"]
+    person.browser.execute_script(
+        "setTimeout(() => { const end = Date.now() + 4000; while (Date.now() < end); }, 50)"
+    )
+    assert "Told to stop." in post(server.url + "/stop", {}, session)
+    person.sees("stopped by ada; nothing more is sent")
+    person.write("Seconds", "8")
+    person.click("Start the check")
+    person.sees("the check is over", "RED", "motor 3")
+    person.picture("console_check")
+
+
+def post(url, fields, session="", headers=None):
+    """Send a form as a program would, and return the answer."""
+    told = {"Cookie": f"failuretwin_session={session}", **(headers or {})}
+    data = urllib.parse.urlencode(fields).encode()
+    with urllib.request.urlopen(urllib.request.Request(url, data, told), timeout=30) as answer:
+        return answer.read().decode()
+
+
+def test_the_pages_have_no_serious_finding_of_axe(person):
+    axe = pytest.importorskip("axe_selenium_python", reason="axe-selenium-python is missing")
+    found = {}
+    pages = ("/", f"/robot?name={LIVE}", f"/history?name={SICK}", "/check", "/import")
+    for page in pages:
+        person.go(page)
+        person.find("//main//h1")
+        time.sleep(1.0)
+        checker = axe.Axe(person.browser)
+        checker.inject()
+        for one in checker.run()["violations"]:
+            if one["impact"] in ("serious", "critical"):
+                found[page, one["id"]] = [node["html"][:300] for node in one["nodes"][:3]]
+    assert found == {}, found
+
+
+def test_no_request_leaves_the_machine(person, server):
+    hosts = set()
+    for entry in person.browser.get_log("performance"):
+        message = json.loads(entry["message"])["message"]
+        if message["method"] == "Network.requestWillBeSent":
+            url = urllib.parse.urlsplit(message["params"]["request"]["url"])
+            hosts.add(url.netloc if url.scheme not in ("data", "blob", "chrome", "about") else "")
+    assert hosts - {""} == {f"127.0.0.1:{server.port}"}
+
+
+def test_a_server_that_was_killed_shows_the_truth_again(person, server):
+    person.go("/")
+    person.sees(SICK)
+    server.kill()
+    person.sees("Connection lost.")
+    server.start()
+    person.sees("Password")  # sessions are held in memory alone
+    person.sign_in("eve", PASSWORD)
+    person.sees(SICK, "signed in as eve (see)")
+
+
+def test_who_may_only_see_changes_nothing(person):
+    person.go(f"/history?name={SICK}")
+    person.sees("Timeline")
+    assert not person.browser.find_elements("xpath", "//button[normalize-space()='Confirm']")
+    person.go("/check")
+    person.find("//button[normalize-space()='STOP']")
+    assert "Start the check" not in person.text

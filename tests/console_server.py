@@ -1,0 +1,80 @@
+"""A console in a process of its own, and a browser without a window, for tests."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from failuretwin.app.console.guard import add_user
+from fleet_servers import free_port
+from waiting import wait_for
+
+REQUIRE = "FAILURETWIN_REQUIRE_CHROMIUM"
+"""Variable that makes tests fail where the browser is not installed."""
+FLAGS = (
+    *("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1300,1000"),
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"),
+)
+PASSWORD = "correct horse"
+USERS = {"ada": "move", "eve": "see"}
+
+
+class ConsoleServer:
+    """A console with a demo, whose users sign in."""
+
+    def __init__(self, folder):
+        pytest.importorskip("nicegui", reason="pip install 'failuretwin[console]'")
+        self.port, self.process, self._folder = free_port(), None, folder
+        self.url = f"http://127.0.0.1:{self.port}"
+        for name, role in USERS.items():
+            add_user(folder / "users.toml", name, role, PASSWORD)
+        self.start()
+
+    def start(self):
+        options = ["--demo", "--demo-robots", "0", "--port", str(self.port)]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "failuretwin", "console", *options, "--users", "users.toml"],
+            cwd=self._folder,
+            env={k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"},
+        )
+        try:
+            wait_for(self._listens)
+        except AssertionError:
+            self.kill()
+            raise
+
+    def _listens(self):
+        assert self.process.poll() is None, "the server ended"
+        with socket.socket() as one:
+            return one.connect_ex(("127.0.0.1", self.port)) == 0
+
+    def kill(self):
+        self.process.kill()
+        self.process.wait()
+
+    def stop(self):
+        self.process.send_signal(signal.SIGINT)
+        self.process.wait(30)
+
+
+def open_browser():
+    """Return a browser, or skip the test."""
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        reason = "no chromium here; install the packages `chromium` and `chromium-driver`"
+        if os.environ.get(REQUIRE):
+            pytest.fail(reason)
+        pytest.skip(reason)
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for flag in FLAGS:
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"performance": "ALL", "browser": "ALL"})
+    return webdriver.Chrome(options, webdriver.ChromeService(driver))
