@@ -13,7 +13,12 @@ from scipy.stats import binom
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.decision.benchmark import real, runner, simulated, tasks
-from failuretwin.decision.benchmark.entries import Classifier, NotEnteredError, entry_of
+from failuretwin.decision.benchmark.entries import (
+    Classifier,
+    NotEnteredError,
+    entry_of,
+    named_runs,
+)
 from failuretwin.decision.evaluation import RunTruth, Truths
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -282,3 +287,12 @@ def test_sources_are_stated():
         assert len(one.commit) == 40 and "/" in one.repository, name
         assert one.licence and all(len(value) == 64 for value in one.files.values())
     assert json.dumps(sorted(real.real_sets()))
+
+
+def test_filters_name_most_faults(data, twin):
+    runs = simulated.load_set("armpi_fpv", "labelled", data)
+    entry = entry_of("kalman", twin, lambda: None)
+    names = [str(h) for h in simulated.classes_of("armpi_fpv")]
+    answers = entry.diagnose(named_runs(runs.drop_vars("fault"), names))
+    right = [a.diagnosis == fault for a, fault in zip(answers, runs["fault"].values, strict=True)]
+    assert np.mean(right) > 0.5  # 1 in 9 by chance
