@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from failuretwin.app.reports.benchmark_page import figure
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.decision.benchmark import real, runner, simulated, tasks
@@ -122,7 +123,10 @@ def test_an_impossible_truth_is_infinitely_bad():
     scores = tasks.TASKS["isolate"].score(judged([("motor_2:stuck", CALM), ("healthy", CALM)]))
     assert scores[0].value == 50.0
     assert scores[1].value == np.inf
-    assert runner._rounded(scores[1])["value"] == "inf"
+    stored = runner._rounded(scores[1])
+    assert (stored["value"], stored["infinite"]) == (None, True)
+    assert figure(stored) == "infinite"
+    assert runner._rounded(scores[0])["infinite"] is False
 
 
 def test_blame_is_not_the_true_motor():
