@@ -10,8 +10,8 @@ from scipy.stats import multivariate_normal
 
 from failuretwin.app.reports.rivals_page import rivals_table, write_rivals
 from failuretwin.core.errors import InputError
-from failuretwin.decision.benchmark.baselines import CORRELATION, KalmanBank
-from failuretwin.decision.learned.feature_encoder import POINTS, Signals
+from failuretwin.decision.benchmark.baselines import Displacement, KalmanBank, Readings
+from failuretwin.decision.learned.feature_encoder import POINTS
 from failuretwin.decision.learned.paper_study import PLAN_FILE, WORK, StudyPlan, stand_in_test_set
 from failuretwin.decision.rivals import study
 from failuretwin.digital_model.twin import DigitalTwin
@@ -28,10 +28,9 @@ def test_a_filter_gives_the_joint_density_of_its_readings(armpi):
     path, jacobian = bank.twin.path_and_jacobian(angle)
     first, drift = rng.uniform(1e-4, 4e-4, motors), rng.uniform(1e-5, 4e-5, motors)
     measured = path + 1e-4 * rng.standard_normal(path.shape)
-    time = np.arange(steps) * 0.1
-    signals = Signals(time, angle, measured, time[-1:])
-    still = np.zeros((1, steps), dtype=bool)
-    found = bank._filtered(signals, angle, still, first, drift, np.zeros(motors))[0]
+    readings = Readings(measured, np.ones((1, steps), dtype=bool))
+    displacement = Displacement(first, drift, np.zeros(motors))
+    found = bank.log_likelihood(readings, angle, displacement)[0]
     # Displacement at step k: the first one plus k + 1 drifts; steps share what came before.
     share = [[np.diag(first + (min(i, j) + 1) * drift) for j in range(steps)] for i in range(steps)]
     rows = np.zeros((3 * steps, motors * steps))
@@ -41,7 +40,7 @@ def test_a_filter_gives_the_joint_density_of_its_readings(armpi):
     spread = rows @ np.block(share) @ rows.T + noise * np.eye(3 * steps)
     density = multivariate_normal(np.zeros(3 * steps), spread).logpdf((measured - path).ravel())
     constant = 1.5 * steps * np.log(2.0 * np.pi)
-    assert CORRELATION * found == pytest.approx(density + constant, rel=1e-9)
+    assert found == pytest.approx(density + constant, rel=1e-9)
 
 
 def test_kernels_are_convolutions():

@@ -10,10 +10,16 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from failuretwin.app.reports.benchmark_page import figure
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.decision.benchmark import real, runner, simulated, tasks
-from failuretwin.decision.benchmark.entries import Classifier, NotEnteredError, entry_of
+from failuretwin.decision.benchmark.entries import (
+    Classifier,
+    NotEnteredError,
+    entry_of,
+    named_runs,
+)
 from failuretwin.decision.evaluation import RunTruth, Truths
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -117,7 +123,10 @@ def test_an_impossible_truth_is_infinitely_bad():
     scores = tasks.TASKS["isolate"].score(judged([("motor_2:stuck", CALM), ("healthy", CALM)]))
     assert scores[0].value == 50.0
     assert scores[1].value == np.inf
-    assert runner._rounded(scores[1])["value"] == "inf"
+    stored = runner._rounded(scores[1])
+    assert (stored["value"], stored["infinite"]) == (None, True)
+    assert figure(stored) == "infinite"
+    assert runner._rounded(scores[0])["infinite"] is False
 
 
 def test_blame_is_not_the_true_motor():
@@ -282,3 +291,12 @@ def test_sources_are_stated():
         assert len(one.commit) == 40 and "/" in one.repository, name
         assert one.licence and all(len(value) == 64 for value in one.files.values())
     assert json.dumps(sorted(real.real_sets()))
+
+
+def test_filters_name_most_faults(data, twin):
+    runs = simulated.load_set("armpi_fpv", "labelled", data)
+    entry = entry_of("kalman", twin, lambda: None)
+    names = [str(h) for h in simulated.classes_of("armpi_fpv")]
+    answers = entry.diagnose(named_runs(runs.drop_vars("fault"), names))
+    right = [a.diagnosis == fault for a, fault in zip(answers, runs["fault"].values, strict=True)]
+    assert np.mean(right) > 0.5  # 1 in 9 by chance

@@ -35,15 +35,13 @@ HEADLINES = {
 """The figure of each task that the short table shows."""
 
 
-def _number(value: float | str | None) -> str:
-    if value is None:
-        return "-"
-    return "inf" if isinstance(value, str) else f"{value:.3g}"
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
 
 
 def figure(score: Mapping[str, Any]) -> str:
     """Return a score with its interval, where it has one."""
-    text = _number(score["value"])
+    text = "infinite" if score["infinite"] else _number(score["value"])
     if score["value"] is None or score["low"] is None or score["high"] is None:
         return text
     return f"{text} ({_number(score['low'])} to {_number(score['high'])})"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -89,99 +90,119 @@ class Bayes(Calibrated):
 class KalmanBank(Calibrated):
     """Bank of extended Kalman filters, one for each hypothesis (Magill, IEEE TAC 1965).
 
-    The state is the displacement of each motor from the healthy response [rad]. A motor with a
-    steady-state error may jump at the start of each movement. A stuck motor keeps the angle that it
-    had `HELD_FROM_S` after the start: its displacement is known up to a constant. The posterior is
-    that of the innovations' likelihoods, divided by `CORRELATION`, since errors of the model last
-    over readings.
+    The state is the displacement of each motor from the healthy response [rad]. It jumps at the
+    start of each movement by scatter and friction, by the sag of the class where the robot is not
+    calibrated, and further where the motor has a steady-state error. A stuck motor keeps the angle
+    that it had `HELD_FROM_S` after the start, up to a constant. All readings within `LASTING_S`
+    count as one, since errors of the model last as long.
     """
 
     def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
         """Return the posterior of each run by its filters."""
-        signals, motors = signals_of(runs), self.twin.robot.motor_names
+        whole = signals_of(runs)
+        speed = np.abs(np.diff(whole.command, axis=1, prepend=whole.command[:, :1])).max(axis=2)
+        steps = np.flatnonzero(whole.seen.any(axis=0))
+        expected = self._expected(whole, runs)[:, steps]
+        signals = Signals(
+            whole.time[steps], whole.command[:, steps], whole.measured[:, steps], whole.duration
+        )
+        readings = Readings(signals.measured, signals.seen & (speed[:, steps] <= STILL_RAD))
         hypotheses = [h for h in _hypotheses(runs) if h.known]
-        likelihood = np.stack(
-            [self._log_likelihood(signals, h.faults, motors, runs) for h in hypotheses], axis=1
-        )
-        return _diagnoses(runs, [str(h) for h in hypotheses], softmax(likelihood, axis=1))
+        likelihood = []
+        for hypothesis in hypotheses:
+            angle, displacement = self._model(hypothesis.faults, expected, signals.time, runs)
+            likelihood.append(self.log_likelihood(readings, angle, displacement))
+        alike = max(1.0, LASTING_S / float(np.median(np.diff(signals.time))))
+        chances = softmax(np.stack(likelihood, axis=1) / alike, axis=1)
+        return _diagnoses(runs, [str(h) for h in hypotheses], chances)
 
-    def _log_likelihood(
-        self,
-        signals: Signals,
-        faults: tuple[Fault, ...],
-        motors: list[str],
-        runs: xr.Dataset,
-    ) -> FloatArray:
-        """Return the log likelihood of one hypothesis for each run, (run,) [nats]."""
-        healthy = self.healthy(runs)
-        kind, robot = class_of(self.twin.robot), self.twin.robot
-        command, time = signals.command, signals.time
-        settling = healthy.settling
-        lag = np.asarray(expectation_of(robot, healthy).lag_s)
-        angle = np.stack(
-            [
-                np.stack([np.interp(time - lag[m], time, one[:, m]) for one in command])
-                for m in range(len(motors))
-            ],
-            axis=-1,
-        )
-        if settling is not None:
-            angle = angle + settling.offset(robot, angle, np.zeros_like(angle))
+    def _expected(self, signals: Signals, runs: xr.Dataset) -> FloatArray:
+        """Return the angles of a healthy arm, (run, time, motor) [rad]."""
+        robot, healthy, time = self.twin.robot, self.healthy(runs), signals.time
+        angle = signals.command.copy()
+        for motor, lag in enumerate(expectation_of(robot, healthy).lag_s):
+            for run, command in enumerate(signals.command[..., motor]):
+                angle[run, :, motor] = np.interp(time - lag, time, command)
+        if healthy.settling is None:
+            return angle
+        return angle + healthy.settling.offset(robot, angle, np.zeros_like(angle))
+
+    def _model(
+        self, faults: tuple[Fault, ...], expected: FloatArray, time: FloatArray, runs: xr.Dataset
+    ) -> tuple[FloatArray, Displacement]:
+        """Return the expected angles of a hypothesis, and what is known of the displacements."""
+        kind, angle, motors = class_of(self.twin.robot), expected.copy(), expected.shape[2]
         still = np.hypot(kind.scatter_rad, kind.friction_rad)
-        doubt = np.hypot(still, 0.0 if runs.attrs["individual"] in self.known else kind.bias_rad)
-        first = np.full(len(motors), doubt**2)
-        drift = np.full(len(motors), still**2 * WANDER)
-        jump = np.zeros(len(motors))
+        new = runs.attrs["individual"] not in self.known
+        first = np.full(motors, new * kind.bias_rad**2)
+        jump = np.full(motors, still**2 + new * kind.sag_rad**2)
         for fault in faults:
-            motor = motors.index(fault.motor)
+            motor = self.twin.robot.motor_names.index(fault.motor)
             if fault.mode == "stuck":
                 held = int(np.searchsorted(time, HELD_FROM_S))
                 angle[:, held:, motor] = angle[:, held : held + 1, motor]
                 first[motor] += HELD_RAD**2
+                jump[motor] = 0.0
             else:
-                jump[motor] = (JUMP * still) ** 2
-        speed = np.abs(np.diff(command, axis=1, prepend=command[:, :1])).max(axis=2)
-        moving = np.asarray(speed > 1e-5)
-        return self._filtered(signals, angle, moving, first, drift, jump)
+                jump[motor] += (JUMP * still) ** 2
+        return angle, Displacement(first, np.full(motors, WANDER * still**2), jump)
 
-    def _filtered(
-        self,
-        signals: Signals,
-        angle: FloatArray,
-        moving: BoolArray,
-        first: FloatArray,
-        drift: FloatArray,
-        jump: FloatArray,
+    def log_likelihood(
+        self, readings: Readings, angle: FloatArray, displacement: Displacement
     ) -> FloatArray:
-        steps = np.flatnonzero(signals.seen.any(axis=0))
-        path, jacobian = self.twin.path_and_jacobian(angle[:, steps])
+        """Return the log density of the readings at rest, (run,) [nats], without its constant."""
+        path, jacobian = self.twin.path_and_jacobian(angle)
         runs, motors = len(angle), angle.shape[2]
-        state = np.zeros((runs, motors))
-        spread = np.broadcast_to(np.diag(first + jump), (runs, motors, motors)).copy()
+        state, drift = np.zeros((runs, motors)), np.diag(displacement.drift)
+        jump = np.diag(displacement.jump)
+        spread = np.tile(np.diag(displacement.first) + jump, (runs, 1, 1))
         noise = (SENSOR_OF_REACH * self.twin.robot.reach) ** 2 * np.eye(3)
-        total, was_moving = np.zeros(runs), np.zeros(runs, dtype=bool)
-        for place, step in enumerate(steps):
-            seen = signals.seen[:, step] & ~moving[:, step]  # poses at rest alone
-            starts = moving[:, step] & ~was_moving
-            was_moving = moving[:, step]
-            spread += np.diag(drift) + starts[:, None, None] * np.diag(jump)
-            rows = jacobian[:, place]
-            innovation = signals.measured[:, step] - path[:, place]
+        total, rested = np.zeros(runs), np.ones(runs, dtype=bool)
+        for step in range(angle.shape[1]):
+            rests, rows = readings.rests[:, step], jacobian[:, step]
+            spread = spread + drift + (rested & ~rests)[:, None, None] * jump
+            rested = rests
+            innovation = readings.measured[:, step] - path[:, step]
             innovation = innovation - np.einsum("ram,rm->ra", rows, state)
-            innovation = np.where(seen[:, None], innovation, 0.0)
+            innovation = np.where(rests[:, None], innovation, 0.0)
             cross = np.einsum("rmn,ran->rma", spread, rows)
             known = np.linalg.inv(np.einsum("ram,rmb->rab", rows, cross) + noise)
             squares = np.einsum("ra,rab,rb->r", innovation, known, innovation)
             fit = 0.5 * np.linalg.slogdet(known)[1] - 0.5 * np.minimum(squares, LARGEST_SQUARE)
-            total += np.where(seen, fit, 0.0)
-            gain = np.einsum("rma,rab->rmb", cross, known) * seen[:, None, None]
+            total += np.where(rests, fit, 0.0)
+            gain = np.einsum("rma,rab->rmb", cross, known) * rests[:, None, None]
             state = state + np.einsum("rma,ra->rm", gain, innovation)
             left = np.eye(motors) - np.einsum("rma,ran->rmn", gain, rows)
             spread = np.einsum("rmn,rnk,rlk->rml", left, spread, left)  # Joseph's form
             spread += np.einsum("rma,ab,rnb->rmn", gain, noise, gain)
-        return total / CORRELATION
+        return total
 
 
+@dataclass(frozen=True)
+class Readings:
+    """Tool positions, (run, step, axis) [m], and whether the arm rests then, (run, step)."""
+
+    measured: FloatArray
+    rests: BoolArray
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """Variances of the motors' displacements, (motor,) each [rad^2].
+
+    Attributes:
+        first: At the start of a run.
+        drift: Gained from one reading to the next.
+        jump: Gained when a movement starts.
+    """
+
+    first: FloatArray
+    drift: FloatArray
+    jump: FloatArray
+
+
+STILL_RAD = 1e-5
+"""Largest change of a command from one sample to the next at rest [rad]."""
 HELD_FROM_S = 0.5
 """When a stuck motor is taken to stop [s]: the onset of the published data."""
 HELD_RAD = 0.05
@@ -194,5 +215,5 @@ SENSOR_OF_REACH = 1e-3
 """Deviation of a reading on each axis, in the reach [-]."""
 LARGEST_SQUARE = 30.0
 """Largest squared normalised innovation: outliers count no more [-]."""
-CORRELATION = 5.0
-"""Readings that count as one."""
+LASTING_S = 2.0
+"""Time that errors of the model last: one movement [s]."""

@@ -224,10 +224,8 @@ def _rounded(score: Score) -> dict[str, Any]:
     table = asdict(score)
     for name in ("value", "low", "high"):
         number = float(table[name])
-        table[name] = None if not math.isfinite(number) else round(number, DIGITS)
-        if number == math.inf:
-            table[name] = "inf"
-    return table
+        table[name] = round(number, DIGITS) if math.isfinite(number) else None
+    return table | {"infinite": score.value == math.inf}
 
 
 # Files of results, also of other people.
@@ -235,7 +233,7 @@ def _rounded(score: Score) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class StoredScore:
-    """One score of a file."""
+    """One score of a file; None: it does not exist, or is `infinite`."""
 
     task: str
     arm: str
@@ -243,9 +241,10 @@ class StoredScore:
     track: str
     metric: str
     runs: int
-    value: float | str | None = None
-    low: float | str | None = None
-    high: float | str | None = None
+    value: float | None = None
+    low: float | None = None
+    high: float | None = None
+    infinite: bool = False
 
 
 KEYS = ("benchmark", "method", "failuretwin_version", "seconds", "scores", "answers")
