@@ -101,7 +101,7 @@ def test_a_store_of_every_revision_is_brought_up_to_date_with_its_data(place, re
     assert counts(place, ROWS) == before == [(table, 1) for table in ROWS]
     found = ft.open_store(place.url).history("arm_7")
     assert (found.episodes[0].state, found.calibrations[0].document) == ("suspected", "x = 1")
-    if revision != migrations.HEAD:  # later ones count as they store
+    if int(revision) < 5:  # later ones count as they store
         assert found.counts == {"healthy": 1}
     with pytest.raises(Exception, match="append-only"):
         refused(place, "DELETE FROM robots")
