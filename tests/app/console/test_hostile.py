@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import urllib.parse
+from contextlib import closing
 
 import pytest
 
@@ -67,14 +68,15 @@ FOREIGN = (
 def answer(server, method, path, headers=None, body=None):
     """Return status, headers and body of a request, sent as it is."""
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
-    connection.putrequest(method, path, skip_host="Host" in (headers or {}))
-    data = (body or "").encode()
-    told = {"Content-Length": str(len(data))} if body is not None else {}
-    for name, value in {**told, **(headers or {})}.items():
-        connection.putheader(name, value)
-    connection.endheaders(data or None)
-    found = connection.getresponse()
-    return found.status, dict(found.getheaders()), found.read().decode("utf-8", "replace")
+    with closing(connection):
+        connection.putrequest(method, path, skip_host="Host" in (headers or {}))
+        data = (body or "").encode()
+        told = {"Content-Length": str(len(data))} if body is not None else {}
+        for name, value in {**told, **(headers or {})}.items():
+            connection.putheader(name, value)
+        connection.endheaders(data or None)
+        found = connection.getresponse()
+        return found.status, dict(found.getheaders()), found.read().decode("utf-8", "replace")
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ from failuretwin.connection.links.base import Order, Reading
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.records.overview import RobotGlance
+from failuretwin.data_knowledge.records.store import open_store
 from failuretwin.decision.acting.work import Halted
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 
@@ -66,6 +67,25 @@ def test_only_the_suspected_motor_of_the_drawn_arm_differs(armpi):
     assert np.argmin(left) == 2
     assert left[2] < 1e-5
     assert left[-1] == pytest.approx(np.linalg.norm(tool - arm.tool(command[None])[0][0]))
+
+
+def test_an_overview_of_the_store_and_a_repair_that_is_taken_back(armpi, tmp_path):
+    store = open_store(tmp_path / "robots.db", create=True)
+    stuck = Diagnosis("run", {"healthy": 0.01, "motor_3:stuck": 0.99}, verdict="motor 3 stuck")
+    store.remember([stuck], "arm", profile=armpi)
+    (one,) = store.overview()
+    assert (one.robot, one.kind, one.state) == ("arm", "armpi_fpv", "faulty")
+    assert one.faults == {"motor_3:stuck": False}
+    (run,) = store.runs("arm")
+    assert (run.name, run.posterior, run.position) == ("run", dict(stuck.posterior), 0)
+    store.found("arm", 1, "wrong")
+    assert store.overview()[0].faults == {}
+    store.repaired("arm", "motor_3", part="gear")
+    assert len(store.history("arm").repairs) == 1
+    store.withdraw_repair("arm", "motor_3", person="Ada")
+    assert store.history("arm").repairs == ()
+    with pytest.raises(InputError, match="no repair to withdraw"):
+        store.withdraw_repair("arm", "motor_3")
 
 
 def test_passwords_are_salted_and_files_of_users_are_checked(tmp_path):

@@ -20,6 +20,7 @@ from console_server import PASSWORD
 
 pytest.importorskip("selenium", reason="selenium is not installed")
 from selenium.common.exceptions import WebDriverException
+from selenium.webdriver.common.keys import Keys
 
 SICK, LIVE, SILENT = "hall_2-arm_7", "hall_1-arm_2", "hall_1-arm_3"
 PICTURES = os.environ.get("FAILURETWIN_PICTURES")
@@ -58,7 +59,7 @@ class Person:
 
     def write(self, label, words):
         field = self.find(f"//input[@aria-label='{label}' or @name='{label}']")
-        field.clear()
+        field.send_keys(Keys.CONTROL + "a")
         field.send_keys(words)
 
     @property

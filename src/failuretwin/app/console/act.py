@@ -74,7 +74,9 @@ class CheckPage:
         text(texts.CHECK_NOTE.format(place=where))
         if place and not desk.move:
             text(texts.NO_MOVE)
-        self._seconds = ui.number(texts.SECONDS, value=20, min=5, max=LONGEST_CHECK_S)
+        self._seconds = ui.number(texts.SECONDS, value=20, min=5, max=LONGEST_CHECK_S).classes(
+            "w-32"
+        )
         with ui.row().classes("gap-4 items-center"):
             if visit.session.may(MOVE):
                 button(texts.START, self._start)

@@ -37,6 +37,8 @@ ROLES = (SEE, CONFIRM, MOVE)
 SESSION_S = 8 * 3600.0
 """Time without a request after which a session ends [s]."""
 COOKIE = "failuretwin_session"
+ALIVE = "/alive"
+"""Answers 200 to a page whose session goes on, else 401."""
 WORK = {"n": 2**14, "r": 8, "p": 1}
 """Cost of a password hash: about 50 ms."""
 TRIES, TRIES_S = 5, 60.0
@@ -231,7 +233,7 @@ class Guard:
             return
         token = _token(headers)
         path, session = scope["path"], self._sessions.of(token)
-        if scope["type"] == "http" and path in ("/login", "/logout", "/stop"):
+        if scope["type"] == "http" and path in ("/login", "/logout", "/stop", ALIVE):
             body = await _form(receive) if scope["method"] == "POST" else None
             answer = self._answer(path, body, token, session)
             await _send(send, *answer)
@@ -264,6 +266,8 @@ class Guard:
         self, path: str, body: Mapping[str, str] | None, token: str | None, session: Session | None
     ) -> tuple[int, str, Mapping[str, str]]:
         """Return status, page and headers of the pages that need no script."""
+        if path == ALIVE:
+            return (401 if session is None else 200), "", {}
         if path == "/stop":
             if session is None:
                 return 303, "", {"location": "/login"}

@@ -15,7 +15,7 @@ from nicegui import events, run, ui
 
 from failuretwin.app.console import texts
 from failuretwin.app.console.desk import Desk
-from failuretwin.app.console.guard import CONFIRM, Session
+from failuretwin.app.console.guard import ALIVE, CONFIRM, Session
 from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.foreign import printable
 from failuretwin.digital_model.robot import Robot
@@ -62,6 +62,12 @@ ZONE_COOKIE = (
     "<script>document.cookie='zone='+Intl.DateTimeFormat().resolvedOptions().timeZone+"
     f"';path=/;SameSite=Strict;max-age={YEAR_S}'</script>"
 )
+RELOAD = (
+    "<script>setInterval(async()=>{if(!window.socket||window.socket.connected)return;"
+    f"try{{await fetch('{ALIVE}');location.reload()}}catch{{}}}},3000)</script>"
+)
+"""Loads a page again that lost its server, once that answers; without a session it leads to the
+login."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +143,7 @@ def page(visit: Visit, title: str) -> Iterator[None]:
     ui.colors(primary="#1f5f99", negative="#b3261e", positive="#1b6e3c", warning="#8a5a00")
     ui.dark_mode({"auto": None, "light": False, "dark": True}[visit.theme])
     ui.add_css(STYLE)
-    ui.add_head_html(ZONE_COOKIE)
+    ui.add_head_html(ZONE_COOKIE + RELOAD)
     with ui.header().classes("items-center gap-4 py-2").props("elevated"):
         with ui.element("nav").classes("flex gap-4").props('aria-label="Main"'):
             for name, target in (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from scipy.optimize import brentq
@@ -107,7 +108,7 @@ def loss_rates(
     delayed: BoolArray,
     robot: Robot,
 ) -> list[LossRates]:
-    """Return the rate of each single motor, and of each set that was seen to go together.
+    """Return the rate of each motor, of each pair, and of each larger set that was seen.
 
     Before any log the punctual rate is that of the arm's class, and the late one is the punctual.
     `lost` are the motors that stayed, (movement, motor); movements (run, movement) that are neither
@@ -115,9 +116,9 @@ def loss_rates(
     """
     at, names, kind = observations.at, robot.motor_names, class_of(robot)
     seen = {tuple(np.flatnonzero(row).tolist()) for row in lost if row.any()}
-    single = {(motor,) for motor in range(len(names))}
+    usual_sets = {one for size in (1, 2) for one in combinations(range(len(names)), size)}
     rates = []
-    for members in sorted(seen | single, key=lambda m: (len(m), m)):
+    for members in sorted(seen | usual_sets, key=lambda m: (len(m), m)):
         chosen = np.array(members)
         pattern = np.isin(np.arange(len(names)), chosen)
         exactly = (lost == pattern).all(axis=1)
@@ -279,9 +280,14 @@ def rate_parameter(name: str, motor: str, rate: Rate) -> Parameter:
 
 
 def loss_parameters(losses: Sequence[LossRates]) -> list[Parameter]:
-    """Return the share of lost commands of each set of motors, punctual and late apart."""
+    """Return the share of lost commands of each motor, punctual and late apart.
+
+    And of each set of motors that was seen to lose one together.
+    """
     found = []
     for loss in losses:
+        if len(loss.motors) > 1 and not (loss.punctual.identified or loss.late.identified):
+            continue
         motors = "+".join(loss.motors)
         found.append(rate_parameter("lost commands", motors, loss.punctual))
         if loss.late.trials:
