@@ -200,7 +200,7 @@ def test_the_page_works_with_the_tool_path_alone(failuretwin, data, armpi, tmp_p
     assert "by the tool path alone" in words
     assert "Not checked on unseen logs" in words
     assert "there is no other session" in words
-    assert len(page.loaded) == 3  # without motors to load
+    assert len(page.loaded) == 1
 
 
 def test_parameters_are_told_in_counts(small, armpi):
