@@ -179,7 +179,7 @@ def test_questions(run, filled):
 
 def test_exports(run, filled, tmp_path):
     run("store", "export", "--out", "tables", *filled)
-    assert len(list((tmp_path / "tables").glob("*.parquet"))) == 16
+    assert len(list((tmp_path / "tables").glob("*.parquet"))) == 17
     told = run("store", "export", "--aas", "arm.aasx", "--robot-name", "arm_7", *filled)
     assert told == "written to arm.aasx: Nameplate, Calibration, Health, FaultHistory\n"
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -184,7 +185,11 @@ def test_lost_commands_are_counted_by_set_of_motors_and_lateness(settle, armpi):
     punctual[1, 4] = False  # of the last movement nobody knows
     lost[9] = True
     found = {loss.motors: loss for loss in loss_rates(seen, lost, punctual, delayed, armpi)}
-    assert set(found) == {("motor_1", "motor_2"), tuple(NAMES), *((name,) for name in NAMES)}
+    pairs = set(combinations(NAMES, 2))  # also those that were not seen: they may come tomorrow
+    assert set(found) == {*pairs, tuple(NAMES), *((name,) for name in NAMES)}
+    unseen = found["motor_3", "motor_4"].punctual
+    assert unseen.hits == 0 < unseen.trials
+    assert unseen.mean == pytest.approx(30 * 0.005 / (unseen.trials + 30))
     first = found["motor_1",]
     assert (first.late.hits, first.punctual.hits) == (1, 1)
     assert first.late.trials == 2 - near[:2, 0].sum()

@@ -141,6 +141,7 @@ def full_place(place, store, armpi):
     store.remember([told], "arm_7", calibration=kept.number)
     store.found("arm_7", 1, "confirmed")
     store.repaired("arm_7", "motor_1")
+    store.withdraw_repair("arm_7", "motor_1")
     store.begin("arm_7", Basis("act"), Note(NOW, "target 1: reached"))
     zero = MotorOffset("motor_1", "zero", 0.1, 0.01, "rad")
     belief = Belief(1, {"mean": np.arange(3.0)}, [{"key": "a"}])
