@@ -145,6 +145,13 @@ def test_delay_counts_from_the_onset_to_the_first_alarm():
     assert found.value == 100.0  # what was said before the onset counts for nothing
 
 
+def test_with_a_wrong_set_up_the_true_motor_may_be_blamed():
+    pairs = [("motor_1:stuck", SURE_1), ("motor_1:stuck", SURE_2)]
+    pairs += [("healthy", SURE_2), ("healthy", CALM)]
+    blamed, right = tasks.TASKS["set_up"].score(judged(pairs))
+    assert (blamed.value, right.value) == (50.0, 50.0)
+
+
 def test_the_smallest_size_is_that_above_all_missed_ones():
     rows = [(0.01, CALM), (0.02, SURE_1), (0.04, CALM), (0.08, SURE_1), (0.16, SURE_1)]
     answers = [Diagnosis(f"r{i}", posterior) for i, (_, posterior) in enumerate(rows)]

@@ -225,7 +225,7 @@ def _rounded(score: Score) -> dict[str, Any]:
     for name in ("value", "low", "high"):
         number = float(table[name])
         table[name] = round(number, DIGITS) if math.isfinite(number) else None
-    return table | {"infinite": score.value == math.inf}
+    return table | {"infinite": math.isinf(score.value)}
 
 
 # Files of results, also of other people.

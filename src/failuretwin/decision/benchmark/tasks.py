@@ -263,7 +263,13 @@ def _live(judged: Judgement) -> list[Score]:
 
 
 def _set_up(judged: Judgement) -> list[Score]:
-    return [_share("motor blamed above 95 % [%]", [_blamed(a) for a in judged.answers])]
+    truths = [Hypothesis.parse(judged.of(a)).faults for a in judged.answers]
+    faulty = [faults[0].motor if faults else "" for faults in truths]
+    pairs = list(zip(judged.answers, faulty, strict=True))
+    return [
+        _share("a wrong motor blamed above 95 % [%]", [_blamed(a, motor) for a, motor in pairs]),
+        _share("correct [%]", [a.diagnosis == judged.of(a) for a in judged.answers]),
+    ]
 
 
 @dataclass(frozen=True)
