@@ -21,8 +21,8 @@ PAGES = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md", ROOT / "CONT
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 TRAINS = 'if __name__ == "__main__":  # other processes'
 """Begins a block that takes ten minutes; `ft.train` has tests of its own."""
-WHOLE = "store.md"
-"""Its commands and code are run together, by `docs/conftest.py`."""
+WHOLE = ("store.md", "benchmark.md")
+"""Their commands and code are run together, by `docs/conftest.py`."""
 GIVEN = {"time": 0.0, "commands": np.zeros((1000, 4)), "points": np.full((1000, 3), 0.1)}
 """What a page says the reader has."""
 CALIBRATIONS = {
@@ -56,7 +56,7 @@ def home(tmp_path_factory, write_session):
 
 @pytest.mark.parametrize(
     "page",
-    [p for p in PAGES if blocks(p, "python") and p.name != WHOLE],
+    [p for p in PAGES if blocks(p, "python") and p.name not in WHOLE],
     ids=lambda p: p.name,
 )
 def test_python_of_a_page_runs(page, home, failuretwin, capsys, monkeypatch):
