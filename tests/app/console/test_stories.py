@@ -152,6 +152,7 @@ def test_a_confirmation_changes_the_learned_rate_and_is_undone(person):
     person.click("Reject: episode 1")
     person.sees("wrong, ada")
     person.click("Undo: episode 1")
+    person.sees("finding 'wrong' withdrawn")
     person.write("Cause", "a loose belt")
     person.click("Other cause: episode 1")
     person.sees("other cause, a loose belt")

@@ -79,6 +79,8 @@ class HistoryPage:
         if not self._visit.allows(CONFIRM):
             return
 
+        told = {field: field.value for field in (self._note, self._cause)}
+
         def stored() -> bool:
             work()
             self._visit.desk.look()
@@ -86,8 +88,9 @@ class HistoryPage:
 
         if await worked(stored):
             ui.notify(texts.STORED, type="positive")
-            for field in (self._note, self._cause):
-                field.set_value("")
+            for field, value in told.items():
+                if field.value == value:  # otherwise the next words are being written
+                    field.set_value("")
             self._draw()
 
     def _found(self, episode: FaultEpisode, verdict: str) -> None:
