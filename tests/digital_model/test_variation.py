@@ -56,13 +56,25 @@ def test_offsets_scatter_about_the_figures_as_declared(varied, known, name):
             assert test.pvalue > SURE
 
 
-@pytest.mark.parametrize("name", ["compliance", "scatter"])
-def test_scales_vary_by_factors(varied, known, name):
-    spread = np.array(getattr(SPREAD, name))
+def log_factors(varied, known, name):
+    """Yield the stated spread of each motor, and the logarithms of its drawn factors."""
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = np.log(drawn(varied, name) / getattr(known.settling, name))
+    spread = np.array(getattr(SPREAD, name))
     for motor in np.flatnonzero((spread > 0) & (np.array(getattr(known.settling, name)) > 0)):
-        assert stats.kstest(factor[:, motor] / spread[motor], "norm").pvalue > SURE
+        yield spread[motor], factor[:, motor]
+
+
+def test_scatter_varies_by_factors(varied, known):
+    for spread, factor in log_factors(varied, known, "scatter"):
+        assert stats.kstest(factor / spread, "norm").pvalue > SURE
+
+
+def test_compliance_is_log_normal_with_the_stated_mean_and_deviation(varied, known):
+    for share, factor in log_factors(varied, known, "compliance"):
+        law = stats.lognorm(np.sqrt(np.log(1.0 + share**2)), scale=1.0 / np.sqrt(1.0 + share**2))
+        np.testing.assert_allclose([law.mean(), law.std()], [1.0, share])
+        assert stats.kstest(np.exp(factor), law.cdf).pvalue > SURE
 
 
 def test_rates_go_up_and_down_together_and_stay_shares(varied, known):

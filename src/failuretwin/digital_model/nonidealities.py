@@ -116,7 +116,8 @@ class Variation(Bounded):
 
     Attributes:
         bias: Standard deviation of the constant error [rad].
-        compliance: Standard deviation of the compliance's logarithm [-].
+        compliance: Standard deviation of the compliance in its mean [-]: log-normal, c exp(u z -
+            u^2 / 2) with u^2 = log(1 + s^2) of mean c, share s and standard normal z.
         friction: Standard deviation of the friction [rad].
         scatter: Standard deviation of the scatter's logarithm [-].
         rates: Standard deviation of the logarithm of every rate of losses, late starts and glitches
@@ -204,10 +205,13 @@ def _vary_settling(settling: Settling, variation: Variation, rng: np.random.Gene
     def normal(spread: tuple[float, ...]) -> FloatArray:
         return rng.standard_normal(len(settling.bias)) * np.asarray(spread or 0.0)
 
+    log_variance = np.log1p(np.square(variation.compliance or 0.0))
+    bias = normal(variation.bias)
+    log_factor = rng.standard_normal(len(bias)) * np.sqrt(log_variance) - 0.5 * log_variance
     return replace(
         settling,
-        bias=tuple(settling.bias + normal(variation.bias)),
-        compliance=tuple(settling.compliance * np.exp(normal(variation.compliance))),
+        bias=tuple(settling.bias + bias),
+        compliance=tuple(settling.compliance * np.exp(log_factor)),
         friction=tuple(settling.friction + normal(variation.friction)),
         scatter=tuple(settling.scatter * np.exp(normal(variation.scatter))),
         payload=settling.payload + float(rng.uniform(*variation.payload)),
