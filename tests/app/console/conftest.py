@@ -5,14 +5,14 @@ import pytest
 from console_server import ConsoleServer, open_browser
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser():
     made = open_browser()
     yield made
     made.quit()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def server(browser, tmp_path_factory):
     made = ConsoleServer(tmp_path_factory.mktemp("console"))
     yield made
