@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.signal import cont2discrete, lfilter
 
 from failuretwin.digital_model.servo import ServoLoop, respond, respond_limited
 
@@ -18,9 +19,16 @@ def limited(travel, limit, ramp_s=0.02, loop=LOOP):
 
 
 def test_without_a_limit_it_is_the_published_loop():
-    reference = 0.3 + np.clip(TIME / 0.02, 0.0, 1.0)
-    expected = respond([LOOP], reference[:, None], STEP_S)[:, 0]
-    assert limited(1.0, np.inf) == pytest.approx(expected, abs=1e-11)
+    loops = [LOOP, ServoLoop(P=0.1, I=15.0, filter_s=0.02)]
+    reference = 0.3 + np.clip(np.stack([TIME / 0.02, TIME / 0.3], axis=1), 0.0, 1.0)
+    angles = respond(loops, np.stack([reference, -reference]), STEP_S)
+    for motor, loop in enumerate(loops):
+        tau, begin = loop.filter_s, reference[0, motor]
+        transfer = [loop.P, loop.I], [tau**2, 2.0 * tau, 1.0 + loop.P, loop.I]
+        b, a, _ = cont2discrete(transfer, STEP_S, method="foh")
+        expected = begin + lfilter(b.ravel(), a, reference[:, motor] - begin)
+        assert angles[0, :, motor] == pytest.approx(expected, abs=1e-9)
+        assert angles[1, :, motor] == pytest.approx(-expected, abs=1e-9)
 
 
 def test_variants_and_tests_do_not_mix():

@@ -4,19 +4,20 @@ Each motor is a PI loop around a second-order input filter, and the joint follow
 
     (P s + I) / (s (tau s + 1)^2 + P s + I)
 
-All solutions are exact between samples. `ServoUnits` is the count scale of a servo.
+All solutions are exact for references that are linear between samples. `ServoUnits` is the count
+scale of a servo.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from failuretwin.core.compiled import compiled
 from failuretwin.core.config import AtLeastZero, Bounded, Bounds
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray, as_floats
@@ -49,24 +50,6 @@ class ServoLoop(Bounded):
                 "filter_s on the loop is not stable (Routh and Hurwitz)."
             )
 
-    def discretise(self, step: float) -> tuple[FloatArray, FloatArray]:
-        """Return numerator and denominator (b, a) of the loop sampled every `step` [s].
-
-        Exact for an input that is linear between samples (first-order hold).
-        """
-        b, a = _discretised(self.P, self.I, self.filter_s, step)
-        return b.copy(), a.copy()
-
-
-@lru_cache(maxsize=256)
-def _discretised(P: float, I: float, tau: float, step: float) -> tuple[FloatArray, FloatArray]:  # noqa: E741
-    from scipy.signal import cont2discrete
-
-    numerator = np.array([P, I])
-    denominator = np.array([tau * tau, 2.0 * tau, 1.0 + P, I])
-    b, a, _ = cont2discrete((numerator, denominator), step, method="foh")
-    return np.ravel(b), np.ravel(a)
-
 
 def respond(loops: Sequence[ServoLoop], command: FloatArray, step: float) -> FloatArray:
     """Return the angles of motors that start at rest at their first command.
@@ -76,41 +59,14 @@ def respond(loops: Sequence[ServoLoop], command: FloatArray, step: float) -> Flo
     Returns:
         Angles at the same instants, (..., time, motor) [rad].
     """
-    from scipy.signal import lfilter
-
     if command.ndim < 2 or command.shape[-1] != len(loops):
         raise InputError(
             f"`command` has shape {command.shape}, expected (..., time, {len(loops)} motors)."
         )
-    response = np.empty((*command.shape[:-2], len(loops), command.shape[-2]))
-    for motor, loop in enumerate(loops):
-        b, a = loop.discretise(step)
-        start = command[..., :1, motor]
-        response[..., motor, :] = start + lfilter(b, a, command[..., motor] - start)
-    return np.swapaxes(response, -1, -2)
-
-
-def first_order_lag(
-    reference: FloatArray, before: FloatArray, step: float, tau: float
-) -> FloatArray:
-    """Return references (..., time) behind a first-order lag; exact for lines between samples.
-
-    Args:
-        reference: (..., time), sampled every `step` [s].
-        before: Output of the lag at the first sample, (...); the result begins with it.
-        step: Time between samples [s].
-        tau: Time constant [s].
-    """
-    from scipy.signal import lfilter
-
-    kept = np.exp(-step / tau)
-    mean = (1.0 - kept) * tau / step
-    out = np.empty_like(reference)
-    out[..., 0] = before
-    memory = (mean - kept) * reference[..., :1] + kept * before[..., None]
-    weights = [1.0 - mean, mean - kept]
-    out[..., 1:], _ = lfilter(weights, [1.0, -kept], reference[..., 1:], zi=memory)
-    return out
+    gains = np.array([(loop.P, loop.I, loop.filter_s) for loop in loops])
+    cases = np.moveaxis(command, -1, 0).reshape(len(loops), -1, command.shape[-2])
+    angles = respond_limited(gains, np.full(len(loops), np.inf), cases, step)
+    return np.moveaxis(angles.reshape(len(loops), *command.shape[:-1]), 0, -1)
 
 
 def respond_limited(
@@ -131,24 +87,82 @@ def respond_limited(
         Angles at the same instants, (variant, test, time) [rad].
     """
     free, held = _transitions(gains, step)
-    begin = reference[..., :1]
-    relative, most = reference - begin, limit[:, None]
-    inputs = np.stack([relative[..., :-1], np.diff(relative, axis=-1) / step], axis=-1)
-    # What the reference adds in every time step, (time - 1, variant, test, 4).
-    drive = np.ascontiguousarray(np.moveaxis(inputs @ free[:, None, 3:], 2, 0))
-    response = np.zeros((reference.shape[-1], *reference.shape[:2]))
-    x = np.zeros((*reference.shape[:2], 3))
-    for i, driven in enumerate(drive):
-        ahead = x @ free[:, :3] + driven
-        speed = ahead[..., 3]
-        too_fast = np.abs(speed) > most
-        if too_fast.any():
-            capped = np.clip(speed, -most, most)[..., None] * held[:, 3:]
-            x = np.where(too_fast[..., None], x @ held[:, :3] + capped, ahead[..., :3])
-        else:
-            x = ahead[..., :3]
-        response[i + 1] = x[..., 2]
-    return begin + np.moveaxis(response, 0, -1)
+    angle = np.empty(reference.shape)
+    _write_angles(reference, step, free, held, limit, angle)
+    return angle
+
+
+@compiled
+def _advance(
+    drive: FloatArray, free: FloatArray, held: FloatArray, limit: float, ahead: FloatArray
+) -> None:
+    """Replace the state in `drive` by the next; `ahead` (4,) is scratch."""
+    for j in range(4):
+        ahead[j] = 0.0
+        for i in range(5):
+            ahead[j] += drive[i] * free[i, j]
+    speed = ahead[3]
+    if abs(speed) > limit:
+        for j in range(3):
+            ahead[j] = np.copysign(limit, speed) * held[3, j]
+            for i in range(3):
+                ahead[j] += drive[i] * held[i, j]
+    for j in range(3):
+        drive[j] = ahead[j]
+
+
+@compiled
+def _write_angles(
+    reference: FloatArray,
+    step: float,
+    free: FloatArray,
+    held: FloatArray,
+    limit: FloatArray,
+    angle: FloatArray,
+) -> None:
+    """Write the angles of `respond_limited`, (variant, test, time)."""
+    variants, tests, count = reference.shape
+    drive, ahead = np.zeros(5), np.zeros(4)  # state, reference, slope; next state, speed
+    for v in range(variants):
+        for n in range(tests):
+            begin = reference[v, n, 0]
+            drive[:] = 0.0
+            for t in range(count):
+                angle[v, n, t] = begin + drive[2]
+                if t + 1 == count:
+                    break
+                drive[3] = reference[v, n, t] - begin
+                drive[4] = (reference[v, n, t + 1] - reference[v, n, t]) / step
+                _advance(drive, free[v], held[v], limit[v], ahead)
+
+
+def first_order_lag(
+    reference: FloatArray, before: FloatArray, step: float, tau: float
+) -> FloatArray:
+    """Return references (..., time) behind a first-order lag; exact for lines between samples.
+
+    Args:
+        reference: (..., time), sampled every `step` [s].
+        before: Output of the lag at the first sample, (...); the result begins with it.
+        step: Time between samples [s].
+        tau: Time constant [s].
+    """
+    kept = np.exp(-step / tau)
+    mean = (1.0 - kept) * tau / step
+    out = np.empty(reference.shape)
+    out[..., 0] = before
+    count = reference.shape[-1]
+    _write_lagged(reference.reshape(-1, count), kept, mean, out.reshape(-1, count))
+    return out
+
+
+@compiled
+def _write_lagged(reference: FloatArray, kept: float, mean: float, out: FloatArray) -> None:
+    """Write what follows the first samples of `first_order_lag`, (case, time)."""
+    for n in range(len(out)):
+        for t in range(1, out.shape[1]):
+            new = (mean - kept) * reference[n, t - 1] + (1.0 - mean) * reference[n, t]
+            out[n, t] = kept * out[n, t - 1] + new
 
 
 def _transitions(gains: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
