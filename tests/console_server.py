@@ -11,7 +11,7 @@ import sys
 
 import pytest
 
-from failuretwin.app.console.guard import add_user
+from failuretwin.app.console.users import add_user
 from fleet_servers import free_port
 from waiting import wait_for
 

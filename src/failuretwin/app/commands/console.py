@@ -69,8 +69,8 @@ def console(
 
     SOURCE is what `watch` listens to. A store and a fleet add their robots. See docs/console.md.
     """
-    from failuretwin.app.console.guard import Sessions, load_users
-    from failuretwin.app.console.guard import add_user as write_user
+    from failuretwin.app.console.users import Sessions, load_users
+    from failuretwin.app.console.users import add_user as write_user
 
     if add_user is not None:
         if users is None:
