@@ -37,7 +37,7 @@ class ConsoleServer:
         self.start()
 
     def start(self):
-        options = ["--demo", "--demo-robots", "0", "--port", str(self.port)]
+        options = ["--demo", "--demo-robots", "0", "--speed", "2", "--port", str(self.port)]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "failuretwin", "console", *options, "--users", "users.toml"],
             cwd=self._folder,

@@ -5,15 +5,15 @@ import pytest
 from console_server import ConsoleServer, open_browser
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser():
     made = open_browser()
     yield made
     made.quit()
 
 
-@pytest.fixture(scope="session")
-def server(browser, tmp_path_factory):
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
     made = ConsoleServer(tmp_path_factory.mktemp("console"))
     yield made
     made.stop()

@@ -103,7 +103,8 @@ def console(
 
         reached = access.to(url) if url is not None else None
         speed = live.speed or 1.0
-        desk = Desk(known, store, reached, arms, move, speed, folder)
+        expected = demo_robots + 1 if demo else 0
+        desk = Desk(known, store, reached, arms, move, speed, folder, expected=expected)
         serve(desk, Listening(host, port, sessions))
 
 

@@ -20,8 +20,6 @@ from failuretwin.digital_model.robot import Robot
 
 THICK = 0.03
 """Radius of a link, as a share of the reach of the arm."""
-GHOST_THICK = 1.3
-"""Radius of the ghost, as a share of that of the arm, so that it is seen around it."""
 GHOST, LINK = "#2f7fd0", "#7d8790"
 SHADES = ((SURE, "#b3261e"), (SUSPECT, "#d98e00"), (0.0, "#1b6e3c"))
 """Colour of a motor from a probability of a fault on."""
@@ -45,7 +43,7 @@ class Arm:
         self._motors: list[Object3D] = []
         self._shade = [""] * len(robot.motors)
         transforms, _ = robot.chain.constants
-        radius = THICK * robot.reach * (1.0 if solid else GHOST_THICK)
+        radius = THICK * robot.reach * (1.0 if solid else 0.8)
         colour, opacity = (LINK, 1.0) if solid else (GHOST, 0.35)
         with scene:
             self._link(transforms[0][:3, 3], radius, colour, opacity)

@@ -40,6 +40,7 @@ SIGNS = {
 }
 LAST_WORD = "last word: {said}"
 NEVER = "nothing was heard yet"
+SIMULATING = "The demo simulates its year of history: {done} of {all} robots are there."
 SET_UP = "the set-up is uncertain: {finding}"
 
 WALL_TEXTS = {

@@ -54,6 +54,7 @@ def show(visit: Visit) -> None:
     with page(visit, texts.WALL):
         ui.add_css(STYLE)
         trouble = draw.alert("")
+        note = draw.text("").props('role="status"')
         wall = Wall()
         ready = False
 
@@ -61,6 +62,7 @@ def show(visit: Visit) -> None:
             if not ready:
                 return
             trouble.set_text(visit.desk.trouble)
+            note.set_text(visit.desk.note)
             wall.show({tile.name: tile.record() for tile in visit.desk.tiles()})
 
         def begin() -> None:
