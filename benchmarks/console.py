@@ -43,10 +43,10 @@ def serve(port: int) -> None:
     """Show many robots and the demo."""
     from failuretwin.app.console.demo import demo_arms
     from failuretwin.app.console.desk import Desk
-    from failuretwin.app.console.guard import Sessions
     from failuretwin.app.console.server import Listening
     from failuretwin.app.console.server import serve as serve_console
     from failuretwin.app.console.state import WORST_FIRST, Tile
+    from failuretwin.app.console.users import Sessions
     from failuretwin.digital_model.calibrated_robot import load_calibration
 
     @dataclass

@@ -11,7 +11,7 @@ import sys
 
 import pytest
 
-from failuretwin.app.console.guard import add_user
+from failuretwin.app.console.users import add_user
 from fleet_servers import free_port
 from waiting import wait_for
 
@@ -37,7 +37,7 @@ class ConsoleServer:
         self.start()
 
     def start(self):
-        options = ["--demo", "--demo-robots", "0", "--port", str(self.port)]
+        options = ["--demo", "--demo-robots", "0", "--speed", "2", "--port", str(self.port)]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "failuretwin", "console", *options, "--users", "users.toml"],
             cwd=self._folder,

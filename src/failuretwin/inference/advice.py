@@ -94,6 +94,10 @@ def next_steps(posterior: Mapping[str, float], arm_class: str = "", alone: str =
     return [_repair(fault, arm_class) for fault in best.faults]
 
 
+STEP = "what to do: "
+"""Begin of a line that says what to do."""
+
+
 def advice_lines(hypothesis: Hypothesis, steps: Sequence[str]) -> list[str]:
     """Return what may have broken and what to do now, a line each.
 
@@ -103,7 +107,7 @@ def advice_lines(hypothesis: Hypothesis, steps: Sequence[str]) -> list[str]:
     """
     modes = [MODES.find(fault.mode) for fault in hypothesis.faults]
     causes = [f"possible causes: {', '.join(m.mechanisms)}" if m.mechanisms else "" for m in modes]
-    told = [f"what to do: {step}" for step in steps if step != NOTHING_TO_DO]
+    told = [f"{STEP}{step}" for step in steps if step != NOTHING_TO_DO]
     if len(told) == len(causes):
         return [line for both in zip(causes, told, strict=True) for line in both if line]
     return [line for line in (*causes, *told) if line]

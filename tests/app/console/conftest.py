@@ -13,7 +13,7 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def server(browser, tmp_path_factory):
+def server(tmp_path_factory):
     made = ConsoleServer(tmp_path_factory.mktemp("console"))
     yield made
     made.stop()

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("nicegui")
 
-from failuretwin.app.console import act, guard, state
+from failuretwin.app.console import act, state, users
 from failuretwin.app.console.checking import HANGS_S, Stoppable, beat_watch
 from failuretwin.connection.links.base import Order, Reading
 from failuretwin.core.errors import InputError
@@ -90,26 +90,26 @@ def test_an_overview_of_the_store_and_a_repair_that_is_taken_back(armpi, tmp_pat
 
 def test_passwords_are_salted_and_files_of_users_are_checked(tmp_path):
     path = tmp_path / "users.toml"
-    guard.add_user(path, "ada", "move", "secret")
-    guard.add_user(path, "bob", "see", "secret")
-    users = guard.load_users(path)
-    assert users["ada"].password != users["bob"].password
+    users.add_user(path, "ada", "move", "secret")
+    users.add_user(path, "bob", "see", "secret")
+    known = users.load_users(path)
+    assert known["ada"].password != known["bob"].password
     assert path.stat().st_mode & 0o077 == 0
-    sessions = guard.Sessions(users)
+    sessions = users.Sessions(known)
     token = sessions.sign_in("ada", "secret")
     assert sessions.of(token).may("confirm")
     assert sessions.sign_in("ada", "Secret") == ""
     path.write_text('[ada]\nrole = "king"\npassword = "scrypt:00:00"\n')
     with pytest.raises(InputError, match="role"):
-        guard.load_users(path)
+        users.load_users(path)
 
 
 def test_sessions_expire(tmp_path, monkeypatch):
-    users = {"ada": guard.User("ada", "see", guard.hashed("secret"))}
-    sessions = guard.Sessions(users)
+    known = {"ada": users.User("ada", "see", users.hashed("secret"))}
+    sessions = users.Sessions(known)
     session = sessions.of(sessions.sign_in("ada", "secret"))
     assert not session.may("confirm")
-    session.seen_s -= guard.SESSION_S + 1.0
+    session.seen_s -= users.SESSION_S + 1.0
     assert not session.may("see")
 
 

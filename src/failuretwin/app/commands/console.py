@@ -69,8 +69,8 @@ def console(
 
     SOURCE is what `watch` listens to. A store and a fleet add their robots. See docs/console.md.
     """
-    from failuretwin.app.console.guard import Sessions, load_users
-    from failuretwin.app.console.guard import add_user as write_user
+    from failuretwin.app.console.users import Sessions, load_users
+    from failuretwin.app.console.users import add_user as write_user
 
     if add_user is not None:
         if users is None:
@@ -103,7 +103,8 @@ def console(
 
         reached = access.to(url) if url is not None else None
         speed = live.speed or 1.0
-        desk = Desk(known, store, reached, arms, move, speed, folder)
+        expected = demo_robots + 1 if demo else 0
+        desk = Desk(known, store, reached, arms, move, speed, folder, expected=expected)
         serve(desk, Listening(host, port, sessions))
 
 

@@ -12,21 +12,12 @@ from pathlib import Path
 
 from nicegui import events, ui
 
-from failuretwin.app.console import texts
+from failuretwin.app.console import draw, texts
 from failuretwin.app.console.checking import CheckRun, beat_watch
 from failuretwin.app.console.desk import Desk, Imported
-from failuretwin.app.console.guard import LARGEST_UPLOAD, MOVE
-from failuretwin.app.console.layout import (
-    Choice,
-    Visit,
-    button,
-    heading,
-    link_to,
-    page,
-    table,
-    text,
-    worked,
-)
+from failuretwin.app.console.guard import LARGEST_UPLOAD
+from failuretwin.app.console.layout import Visit, page
+from failuretwin.app.console.users import MOVE
 from failuretwin.app.reports.check_report import check_lines, closing_lines
 from failuretwin.app.terminal import Table
 from failuretwin.connection.links.base import Commander
@@ -69,22 +60,22 @@ class CheckPage:
         self._known = (desk.robot(name) if name else None) or desk.known
         self._real = bool(place) and desk.move
         if name:
-            ui.link(name, link_to("robot", name=name))
+            ui.link(name, draw.link_to("robot", name=name))
         where = texts.REAL_ARM.format(place=place) if self._real else texts.EMULATED_ARM
-        text(texts.CHECK_NOTE.format(place=where))
+        draw.text(texts.CHECK_NOTE.format(place=where))
         if place and not desk.move:
-            text(texts.NO_MOVE)
+            draw.text(texts.NO_MOVE)
         self._seconds = ui.number(texts.SECONDS, value=20, min=5, max=LONGEST_CHECK_S).classes(
             "w-32"
         )
         with ui.row().classes("gap-4 items-center"):
             if visit.session.may(MOVE):
-                button(texts.START, self._start)
+                draw.button(texts.START, self._start)
             # A form: it works without scripts, so also when the page hangs.
             with ui.element("form").props('method="post" action="/stop" target="stop"'):
-                stop = text(texts.STOP, "button").props('type="submit"')
+                stop = draw.text(texts.STOP, "button").props('type="submit"')
                 stop.classes("state state-alarm text-lg font-bold px-6 py-2")
-        text(texts.STOP_NOTE).classes("soft")
+        draw.text(texts.STOP_NOTE).classes("soft")
         ui.element("iframe").props(f'name="stop" title="{texts.STOP}"').classes("hidden")
         self._lines = ui.element("div").props('role="log" aria-live="polite"')
         self._shown: list[object] = []
@@ -117,7 +108,7 @@ class CheckPage:
         self._lines.clear()
         with self._lines:
             for line in check.lines:
-                text(line)
+                draw.text(line)
             if check.result is not None:
                 _result(check.result, self._known)
 
@@ -147,9 +138,9 @@ def _keep(desk: Desk, known: CalibratedRobot, name: str, result: CheckResult) ->
 def _result(result: CheckResult, known: CalibratedRobot) -> None:
     for part in [*check_lines(result, known.robot, 0.0), *closing_lines(result, known.robot)]:
         if isinstance(part, Table):
-            table(part.headings, part.rows)
+            draw.table(part.headings, part.rows)
         else:
-            text(part)
+            draw.text(part)
 
 
 # Logs.
@@ -172,14 +163,14 @@ def show_import(visit: Visit) -> None:
     with page(visit, texts.IMPORT):
         with ui.row().classes("gap-4 items-end"):
             kinds = sorted({own, *bundled_robots()})
-            kind = Choice(kinds, own, texts.PROFILE)
+            kind = draw.Choice(kinds, own, texts.PROFILE)
             robot = ui.input(texts.ROBOT_NAME).props("maxlength=64").classes("w-64")
         status = ui.element("div").props('role="status"')
 
         async def take(event: events.UploadEventArguments) -> None:
             status.clear()
             with status:
-                text(texts.WORKING)
+                draw.text(texts.WORKING)
             data = await event.file.read()
             arrived = _placed(desk.folder, event.file.name, data)
             wanted = str(robot.value or "").strip() if visit.confirms else ""
@@ -187,7 +178,7 @@ def show_import(visit: Visit) -> None:
             if isinstance(arrived, str):
                 ui.notify(arrived, type="negative", multi_line=True)
             else:
-                found = await worked(desk.diagnose, arrived.path, kind.value, wanted)
+                found = await draw.worked(desk.diagnose, arrived.path, kind.value, wanted)
             status.clear()
             if found is not None:
                 with status:
@@ -228,12 +219,12 @@ async def _show_imported(visit: Visit, found: Imported, kind: str) -> None:
     if known is None:
         return
     state = robot_state(found.diagnoses, known.robot)
-    heading(state.headline)
-    text(state.step)
-    table((texts.RUN, texts.VERDICT), [[one.run, one.verdict] for one in found.diagnoses])
+    draw.heading(state.headline)
+    draw.text(state.step)
+    draw.table((texts.RUN, texts.VERDICT), [[one.run, one.verdict] for one in found.diagnoses])
     for line in found.stored or [texts.NOT_STORED]:
-        text(line)
-    number = await worked(_report, visit.desk, found, known)
+        draw.text(line)
+    number = await draw.worked(_report, visit.desk, found, known)
     if number is not None:
         ui.link(texts.REPORT, f"/report/{number}", new_tab=True)
 

@@ -12,6 +12,7 @@ import numpy as np
 from nicegui import ui
 from nicegui.elements.scene.scene_object3d import Object3D
 
+from failuretwin.app.console import draw
 from failuretwin.app.console.state import SUSPECT
 from failuretwin.core.hypothesis import SURE
 from failuretwin.core.types import BoolArray, FloatArray
@@ -22,6 +23,8 @@ THICK = 0.03
 GHOST, LINK = "#2f7fd0", "#7d8790"
 SHADES = ((SURE, "#b3261e"), (SUSPECT, "#d98e00"), (0.0, "#1b6e3c"))
 """Colour of a motor from a probability of a fault on."""
+CAMERA = (0.65, -0.65, 1.1)
+"""Place of the camera, in reaches of the arm: high, so that arms that fold show it."""
 REACHED, MISSED = [0.11, 0.43, 0.24], [0.7, 0.15, 0.12]
 
 
@@ -116,23 +119,38 @@ class ArmScene:
     """
 
     def __init__(self, robot: Robot, label: str) -> None:
-        reach = robot.reach
-        self._scene = ui.scene(480, 380, grid=(2, 20), background_color="#eef1f4", fps=10)
-        self._scene.props(f'role="img" aria-label="{label}"').classes("w-full")
-        self._solid = Arm(robot, self._scene, solid=True)
-        self._ghost = Arm(robot, self._scene, solid=False)
-        with self._scene:
-            self._points = ui.scene.point_cloud([], point_size=0.012 * reach / 0.3)
-        near = 0.85 * reach
-        self._scene.move_camera(near, -near, 0.9 * near, 0.0, 0.0, 0.35 * reach, duration=0.0)
+        self._robot, self._label = robot, label
+        self._place = ui.element("div").classes("scene")
+        self._arms: tuple[Arm, Arm] | None = None
+        self._now: tuple[FloatArray, FloatArray, Mapping[str, float]] | None = None
+        self._cloud: tuple[list[list[float]], list[list[float]]] = [], []
+        draw.later(self._load)
+
+    def _load(self) -> None:
+        reach = self._robot.reach
+        with self._place:
+            scene = ui.scene(480, 380, grid=(2, 20), background_color="#eef1f4", fps=10)
+            scene.props(f'role="img" aria-label="{self._label}"').classes("full")
+        self._arms = Arm(self._robot, scene, solid=True), Arm(self._robot, scene, solid=False)
+        with scene:
+            self._points = ui.scene.point_cloud(*self._cloud, point_size=0.012 * reach / 0.3)
+        x, y, z = (reach * one for one in CAMERA)
+        scene.move_camera(x, y, z, 0.0, 0.0, 0.4 * reach, duration=0.0)
+        if self._now is not None:
+            self.show(*self._now)
 
     def show(self, pose: FloatArray, command: FloatArray, shares: Mapping[str, float]) -> None:
         """Draw both arms: poses in the sense of the log, (motor,) [rad or m]."""
-        self._solid.pose(pose)
-        self._ghost.pose(command)
-        self._solid.colour(shares)
+        self._now = pose, command, shares
+        if self._arms is not None:
+            solid, ghost = self._arms
+            solid.pose(pose)
+            ghost.pose(command)
+            solid.colour(shares)
 
     def points(self, points: FloatArray, reached: BoolArray) -> None:
         """Draw points (point, 3) [m] in green where they can be reached, else in red."""
         colours = [REACHED if one else MISSED for one in reached.tolist()]
-        self._points.set_points(points.tolist(), colours)
+        self._cloud = points.tolist(), colours
+        if self._arms is not None:
+            self._points.set_points(*self._cloud)

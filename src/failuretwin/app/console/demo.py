@@ -25,6 +25,7 @@ from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.inference.diagnoser import BayesDiagnoser
 
 DAY_S = 86_400
+LOW_PRIORITY = 10
 YEAR_SEED = 5
 ARMS = {
     "hall_1-arm_1": ((), 0.0),
@@ -65,10 +66,15 @@ _TRUTH = ["fault", "fault_detail", "onset", "magnitude"]
 
 
 def write_history(store: Store, robots: int, years: float) -> subprocess.Popen[bytes]:
-    """Simulate years of a fleet into a store, robot by robot, in a process that is returned."""
+    """Simulate years of a fleet into a store, robot by robot, in a process that is returned.
+
+    It gives way to the pages.
+    """
     fleet = ["--fleet", str(robots), "--years", str(years), "--seed", str(YEAR_SEED)]
     command = [sys.executable, "-m", "failuretwin", "simulate", *fleet, "--store", store.name]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    writer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    os.setpriority(os.PRIO_PROCESS, writer.pid, LOW_PRIORITY)
+    return writer
 
 
 def demo_arms(known: CalibratedRobot, speed: float) -> dict[str, LiveRobot]:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin.app.console import state as shown
+from failuretwin.app.console import texts
 from failuretwin.app.console.checking import CheckRun
 from failuretwin.app.console.live import LiveRobot
 from failuretwin.app.console.state import Tile, Trace
@@ -65,6 +66,7 @@ class Desk:
         trouble: Why store or fleet cannot be read at present; empty: they can.
         check: The last check; None: none so far.
         reports: Pages for technicians by number.
+        expected: Robots that the store will have once the history of the demo is simulated.
         beat_s: When the server worked last, by the monotonic clock [s].
     """
 
@@ -78,6 +80,7 @@ class Desk:
     trouble: str = ""
     check: CheckRun | None = None
     reports: dict[int, str] = field(default_factory=dict)
+    expected: int = 0
     beat_s: float = field(default_factory=time.monotonic)
     _glances: tuple[RobotGlance, ...] = ()
     _fleet: tuple[Tile, ...] = ()
@@ -113,6 +116,12 @@ class Desk:
             found[tile.name] = replace(tile, kind=kinds.get(tile.name, tile.kind))
         found |= {name: robot.view.tile for name, robot in self.live.items()}
         return shown.worst_first(list(found.values()))
+
+    @property
+    def note(self) -> str:
+        """How far the history of the demo is; empty: it is complete."""
+        done = len(self._glances)
+        return texts.SIMULATING.format(done=done, all=self.expected) if done < self.expected else ""
 
     def tile(self, name: str) -> Tile | None:
         """Return a robot; None: it is not known."""

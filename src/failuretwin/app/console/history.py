@@ -8,20 +8,9 @@ from functools import partial
 
 from nicegui import ui
 
-from failuretwin.app.console import texts
-from failuretwin.app.console.guard import CONFIRM
-from failuretwin.app.console.layout import (
-    Cell,
-    Choice,
-    Visit,
-    button,
-    heading,
-    link_to,
-    page,
-    table,
-    text,
-    worked,
-)
+from failuretwin.app.console import draw, texts
+from failuretwin.app.console.layout import Visit, page
+from failuretwin.app.console.users import CONFIRM
 from failuretwin.connection.fault_rates import LearnedRates
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.records.episodes import CONFIRMED
@@ -42,9 +31,9 @@ async def show(visit: Visit, name: str) -> None:
     """Draw the page."""
     desk = visit.desk
     with page(visit, f"{texts.HISTORY}: {name}"):
-        ui.link(name, link_to("robot", name=name))
+        ui.link(name, draw.link_to("robot", name=name))
         if desk.store is None or name not in desk.store.robots():
-            text(texts.NO_STORE if desk.store is None else texts.NO_ROBOT).props('role="alert"')
+            draw.alert(texts.NO_STORE if desk.store is None else texts.NO_ROBOT)
             return
         HistoryPage(visit, name, desk.store)
 
@@ -67,7 +56,7 @@ class HistoryPage:
         history = self._store.history(self._name)
         self._body.clear()
         with self._body:
-            text(history.health)
+            draw.text(history.health)
             self._episodes(history)
             self._repair()
             self._rates(history.kind)
@@ -86,7 +75,7 @@ class HistoryPage:
             self._visit.desk.look()
             return True
 
-        if await worked(stored):
+        if await draw.worked(stored):
             ui.notify(texts.STORED, type="positive")
             for field, value in told.items():
                 if field.value == value:  # otherwise the next words are being written
@@ -108,9 +97,9 @@ class HistoryPage:
         self._store.withdraw(self._name, episode.number, person=person, note=note)
 
     def _episodes(self, history: History) -> None:
-        heading(texts.EPISODES)
+        draw.heading(texts.EPISODES)
         time = self._visit.time
-        rows: list[list[Cell]] = []
+        rows: list[list[draw.Cell]] = []
         for one in reversed(history.episodes):
             found = one.finding
             said = (
@@ -130,12 +119,12 @@ class HistoryPage:
                 self._buttons(one),
             ])  # fmt: skip
         heads = (texts.EPISODE, texts.FAULT, texts.STATE, texts.SINCE, texts.FINDING, "")
-        table(heads if self._visit.confirms else heads[:-1], rows)
+        draw.table(heads if self._visit.confirms else heads[:-1], rows)
 
     def _buttons(self, episode: FaultEpisode) -> Callable[[], object]:
         judging = {texts.CONFIRM: CONFIRMED, texts.REJECT: WRONG, texts.OTHER: OTHER_CAUSE}
 
-        def draw() -> None:
+        def buttons() -> None:
             if not self._visit.confirms:
                 return
             for words, verdict in judging.items():
@@ -143,20 +132,20 @@ class HistoryPage:
             if episode.finding is not None:
                 self._button(texts.UNDO, episode, partial(self._withdraw, episode))
 
-        return draw
+        return buttons
 
     def _button(self, words: str, episode: FaultEpisode, work: Callable[[], object]) -> None:
-        made = button(words, lambda: self._state(work)).props("outline")
+        made = draw.button(words, lambda: self._state(work)).props("outline")
         made.props(f'aria-label="{words}: {texts.EPISODE.lower()} {episode.number}"')
 
     def _repair(self) -> None:
         known = self._visit.desk.robot(self._name)
         if known is None or not self._visit.confirms:
             return
-        heading(texts.NOTE_REPAIR)
+        draw.heading(texts.NOTE_REPAIR)
         names = known.robot.motor_names
         with ui.row().classes("gap-4 items-end"):
-            motor = Choice(names, names[0], texts.MOTOR)
+            motor = draw.Choice(names, names[0], texts.MOTOR)
             part = _field(texts.PART)
 
             def work() -> None:
@@ -165,25 +154,25 @@ class HistoryPage:
                     self._name, motor.value, part=_value(part), person=person, note=note
                 )
 
-            button(texts.REPAIR, lambda: self._state(work))
+            draw.button(texts.REPAIR, lambda: self._state(work))
 
             def undo() -> None:
                 person = _value(self._person)
                 self._store.withdraw_repair(self._name, motor.value, person=person)
 
-            button(texts.UNDO_REPAIR, lambda: self._state(undo))
+            draw.button(texts.UNDO_REPAIR, lambda: self._state(undo))
 
     def _rates(self, kind: str) -> None:
         """Draw the learned rates of the faults of this robot."""
         known = self._visit.desk.robot(self._name)
         if known is None:
             return
-        heading(texts.RATES)
+        draw.heading(texts.RATES)
         seen, ages = self._store.fleet_faults(kind), self._store.motor_ages(self._name)
         learned = LearnedRates.of(seen, paper_hypotheses(known.robot.motor_names), ages)
-        text(learned.line)
+        draw.text(learned.line)
         rows = [[one.name, str(one.confirmed), f"{one.factor:.2f}"] for one in learned.rates]
-        table(texts.RATE_COLUMNS, rows)
+        draw.table(texts.RATE_COLUMNS, rows)
 
 
 def _field(label: str, value: str = "") -> ui.input:
@@ -195,21 +184,21 @@ def _value(field: ui.input) -> str:
 
 
 def _timeline(visit: Visit, history: History) -> None:
-    heading(texts.TIMELINE)
+    draw.heading(texts.TIMELINE)
     rows = [[visit.time(one.at), one.kind, one.text] for one in reversed(history.timeline)]
-    table((texts.WHEN, texts.EVENT, texts.SAYS), rows)
+    draw.table((texts.WHEN, texts.EVENT, texts.SAYS), rows)
 
 
 def _compare(visit: Visit, history: History) -> None:
     """Draw the offsets of the motors at two dates."""
-    heading(texts.COMPARE)
+    draw.heading(texts.COMPARE)
     known = visit.desk.robot(history.robot)
     if not history.drifts or known is None:
-        text(texts.NO_OFFSETS)
+        draw.text(texts.NO_OFFSETS)
         return
     days = sorted({f"{at:%Y-%m-%d}" for one in history.drifts for at in one.at})
 
-    def draw() -> None:
+    def show_dates() -> None:
         place.clear()
         dates = [then.value, now.value]
         rows = [
@@ -218,13 +207,13 @@ def _compare(visit: Visit, history: History) -> None:
             if one.motor in known.robot.motor_names
         ]
         with place:
-            table((texts.MOTOR, texts.OFFSET, *dates, texts.CHANGE), rows)
+            draw.table((texts.MOTOR, texts.OFFSET, *dates, texts.CHANGE), rows)
 
     with ui.row().classes("gap-4"):
-        then = Choice(days, days[0], texts.THEN, draw)
-        now = Choice(days, days[-1], texts.NOW, draw)
+        then = draw.Choice(days, days[0], texts.THEN, show_dates)
+        now = draw.Choice(days, days[-1], texts.NOW, show_dates)
     place = ui.element("div")
-    draw()
+    show_dates()
 
 
 def _at_dates(visit: Visit, drift: Drift, dates: list[str], motor: str) -> list[str]:

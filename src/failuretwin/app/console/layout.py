@@ -1,29 +1,25 @@
-"""What all pages share: header, colours, units, time zone, tables, and who is at the page."""
+"""What all pages share: header, colours, units, time zone, and who is at the page."""
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TYPE_CHECKING, TypeVar
-from urllib.parse import quote
+from typing import TYPE_CHECKING
 from zoneinfo import ZoneInfo
 
 import numpy as np
-from nicegui import events, run, ui
+from nicegui import ui
 
-from failuretwin.app.console import texts
+from failuretwin.app.console import draw, texts
 from failuretwin.app.console.desk import Desk
-from failuretwin.app.console.guard import ALIVE, CONFIRM, Session
-from failuretwin.core.errors import FailureTwinError
-from failuretwin.core.foreign import printable
+from failuretwin.app.console.guard import ALIVE
+from failuretwin.app.console.users import CONFIRM, Session
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
     from starlette.requests import Request
-
-T = TypeVar("T")
 
 EXPIRY_S = 5.0
 """Time between two looks whether the session has ended [s]."""
@@ -48,12 +44,17 @@ p { margin: .25rem 0; overflow-wrap: anywhere; }
 .page a { color: var(--link); text-decoration: underline; }
 table.plain { border-collapse: collapse; width: 100%; }
 table.plain th, table.plain td { text-align: left; padding: .25rem .6rem; vertical-align: top;
-  border-bottom: 1px solid var(--line); overflow-wrap: anywhere; }
+  border-bottom: 1px solid var(--line); overflow-wrap: break-word; }
 .state { color: #fff; border-radius: .3rem; padding: 0 .5rem; display: inline-block; }
 .choice { font-size: 1rem; border: 1px solid #6b757e; border-radius: .3rem; padding: .3rem .4rem;
   background: #fff; color: #16191c; }
 .columns { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fit, minmax(20rem, 1fr)); }
 .columns > * { min-width: 0; }
+.full { width: 100%; height: 100%; }
+.scene { height: 24rem; background: #eef1f4; }
+.short { width: 7rem; }
+.chart { height: 14rem; }
+.reason { text-align: left; white-space: normal; }
 .scroll { overflow: auto; max-height: 24rem; }
 .soft { opacity: .85; font-size: .9rem; }
 :focus-visible { outline: 3px solid #d98e00; outline-offset: 2px; }
@@ -63,8 +64,8 @@ ZONE_COOKIE = (
     f"';path=/;SameSite=Strict;max-age={YEAR_S}'</script>"
 )
 RELOAD = (
-    "<script>setInterval(async()=>{if(!window.socket||window.socket.connected)return;"
-    f"try{{await fetch('{ALIVE}');location.reload()}}catch{{}}}},3000)</script>"
+    "<script>{let was=false;setInterval(async()=>{if(window.socket?.connected)was=true;"
+    f"else if(was)try{{await fetch('{ALIVE}');location.reload()}}catch{{}}}},3000)}}</script>"
 )
 """Loads a page again that lost its server, once that answers; without a session it leads to the
 login."""
@@ -168,7 +169,7 @@ def page(visit: Visit, title: str) -> Iterator[None]:
 
     ui.timer(EXPIRY_S, look)
     with main:
-        heading(title, 1)
+        draw.heading(title, 1)
         yield
 
 
@@ -178,112 +179,13 @@ def _choice(value: str, name: str, label: str) -> None:
         f"document.cookie='{name}='+event.target.value+';path=/;SameSite=Strict;max-age={YEAR_S}'"
     )
     with ui.element("label").classes("text-white text-sm flex items-center gap-1"):
-        text(label, "span")
+        draw.text(label, "span")
         with (
             ui.element("select")
             .props(f'onchange="{chosen};location.reload()"')
             .classes("text-black bg-white rounded px-1")
         ):
             for key, shown in CHOICES[name].items():
-                option = text(shown, "option").props(f'value="{key}"')
+                option = draw.text(shown, "option").props(f'value="{key}"')
                 if key == value:
                     option.props("selected")
-
-
-def text(words: str, tag: str = "p") -> ui.label:
-    """Draw text, never as markup; return its element."""
-    return _Text(printable(words), tag)
-
-
-class _Text(ui.label):
-    """A label with another tag."""
-
-    def __init__(self, words: str, tag: str) -> None:
-        super().__init__(words)
-        self.tag = tag
-
-
-def heading(words: str, level: int = 2) -> ui.label:
-    """Draw a heading."""
-    return text(words, f"h{level}")
-
-
-def state_badge(state: str) -> ui.label:
-    """Draw a state by word, sign and colour."""
-    words = f"{texts.SIGNS[state]} {texts.STATES[state]}"
-    return text(words, "span").classes(f"state state-{state}")
-
-
-class Choice:
-    """A choice that screen readers know: the select of the browser.
-
-    Attributes:
-        value: What is chosen.
-    """
-
-    def __init__(
-        self,
-        options: Sequence[str],
-        value: str,
-        label: str,
-        on_change: Callable[[], object] = lambda: None,
-    ) -> None:
-        self.value = value
-        self._options, self._on_change = options, on_change
-        with ui.element("label").classes("flex flex-col text-sm"):
-            text(label, "span")
-            chosen = ui.element("select").classes("choice")
-            chosen.on("change", self._choose, js_handler="(e) => emit(e.target.selectedIndex)")
-            with chosen:
-                for one in options:
-                    option = text(one, "option")
-                    if one == value:
-                        option.props("selected")
-
-    def _choose(self, event: events.GenericEventArguments) -> None:
-        if isinstance(event.args, int) and 0 <= event.args < len(self._options):
-            self.value = self._options[event.args]
-            self._on_change()
-
-
-Cell = str | Callable[[], object]
-"""Cell of a table: text, or what draws it."""
-
-
-def table(headings: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
-    """Draw a table; cells are texts, or draw themselves."""
-    with ui.element("div").classes("scroll").props('tabindex="0" role="region"') as region:
-        region.props(f'aria-label="{headings[0]}"')
-        with ui.element("table").classes("plain"):
-            with ui.element("thead"), ui.element("tr"):
-                for one in headings:
-                    text(one, "th").props('scope="col"')
-            with ui.element("tbody"):
-                for row in rows:
-                    with ui.element("tr"):
-                        for cell in row:
-                            if isinstance(cell, str):
-                                text(cell, "td")
-                            else:
-                                with ui.element("td"):
-                                    cell()
-
-
-def link_to(page_name: str, **query: object) -> str:
-    """Return the address of a page of a robot."""
-    told = "&".join(f"{name}={quote(str(value), safe='')}" for name, value in query.items())
-    return f"/{page_name}?{told}"
-
-
-async def worked(work: Callable[..., T], *values: object) -> T | None:
-    """Do work in a thread; tell what is wrong and return None if it cannot be done."""
-    try:
-        return await run.io_bound(work, *values)
-    except FailureTwinError as error:
-        ui.notify(printable(str(error)), type="negative", multi_line=True, timeout=15_000)
-        return None
-
-
-def button(words: str, press: Callable[[], object] | Callable[[], Awaitable[object]]) -> ui.button:
-    """Draw a button."""
-    return ui.button(words, on_click=press).props("no-caps dense").classes("px-3")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import time
 from collections.abc import Callable
@@ -13,16 +14,19 @@ from nicegui import app, core, ui
 from starlette.requests import Request
 from starlette.responses import HTMLResponse
 
-from failuretwin.app.console import act, history, robot, texts, wall
+from failuretwin.app.console import act, history, replay, robot, texts, wall
 from failuretwin.app.console.desk import Desk
-from failuretwin.app.console.guard import COOKIE, Guard, Session, Sessions
+from failuretwin.app.console.guard import COOKIE, Guard
 from failuretwin.app.console.layout import Visit
+from failuretwin.app.console.users import Session, Sessions
 from failuretwin.app.terminal import tell
 
 LOCAL = frozenset({"127.0.0.1", "localhost", "::1"})
 """Names of this computer."""
 BEAT_S = 0.25
 """Time between two signs that the server works [s]."""
+PATIENCE_S = 10.0
+"""Time that a page may be silent, such as while it draws, before it counts as closed [s]."""
 LARGEST_MESSAGE = 1024 * 1024
 """Largest message of a page [bytes]."""
 
@@ -40,6 +44,14 @@ class Listening:
     host: str
     port: int
     sessions: Sessions
+
+
+class _WithoutLeavers(logging.Filter):
+    """Leaves out browsers that went on before their answer, which Starlette logs as an error."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        error = record.exc_info[1] if record.exc_info else None
+        return str(error) != "No response returned."
 
 
 def serve(desk: Desk, listening: Listening) -> None:
@@ -70,6 +82,7 @@ def serve(desk: Desk, listening: Listening) -> None:
     app.on_startup(lambda: asyncio.create_task(beat()))
     app.on_startup(desk.start)
     app.on_shutdown(desk.stop)
+    logging.getLogger("uvicorn.error").addFilter(_WithoutLeavers())
     tell(f"console: http://{listening.host}:{listening.port} (stop with Ctrl-C)")
     os.environ.setdefault("NICEGUI_STORAGE_PATH", str(desk.folder / "nicegui"))
     ui.run(
@@ -83,6 +96,7 @@ def serve(desk: Desk, listening: Listening) -> None:
         show=False,
         show_welcome_message=False,
         message_history_length=200,
+        reconnect_timeout=PATIENCE_S,
         ws_max_size=LARGEST_MESSAGE,
         server_header=False,
     )
@@ -99,7 +113,7 @@ def _add_pages(desk: Desk, visit_of: Callable[[Request], Visit]) -> None:
 
     @ui.page("/replay", response_timeout=60.0)
     async def replay_page(request: Request, name: str = "", run: int = 0, at: float = 0.0) -> None:
-        await robot.replay(visit_of(request), name, run, at)
+        await replay.show(visit_of(request), name, run, at)
 
     @ui.page("/history")
     async def history_page(request: Request, name: str = "") -> None:

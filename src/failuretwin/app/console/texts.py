@@ -40,6 +40,7 @@ SIGNS = {
 }
 LAST_WORD = "last word: {said}"
 NEVER = "nothing was heard yet"
+SIMULATING = "The demo simulates its year of history: {done} of {all} robots are there."
 SET_UP = "the set-up is uncertain: {finding}"
 
 WALL_TEXTS = {
@@ -57,19 +58,19 @@ WALL_TEXTS = {
     "signs": SIGNS,
 }
 
-VERDICT, SINCE, HOW_SURE, WHY, NEXT = "Verdict", "Since", "How sure", "Why", "What to do now"
-ALARM_SINCE = "{time}, alarm number {number}"
-MOVEMENT_BUTTON = "Movement {number}: {nats:+.1f} nats"
+VERDICT, SINCE, WHY, NEXT = "Verdict", "Since", "Why", "What to do now"
+ALARM_SINCE = "alarm number {number}, since {time}"
 MOTORS, MOTOR, STATE, PROBABILITY, SAYS = "Motors", "Motor", "State", "Fault probability", "Says"
 ARM = "Arm: solid where it is, transparent where it was told to be"
+ARM_AT_REST = "Arm at rest, its motors coloured by the last run"
 ARM_NOTE = "The solid arm is drawn from the measured tool and the suspected motor."
-POSTERIOR, RESIDUALS, TOOL = "Probability over time", "Residuals by motor", "Tool path"
+POSTERIOR, RESIDUALS = "Probability over time", "Residuals by motor [mm]"
+TOOL, TOOL_NOTE = "Tool path [mm]", "Solid: measured; dashed: commanded."
 RESIDUAL_NOTE = "What remains of the tool error if only this motor differs from its command."
 TOTAL = "tool error"
 ANGLES, TOLD, DRAWN = "Angles", "Told", "Drawn"
-COMMANDED, MEASURED = "commanded", "measured"
 BLIND, ASK_BLIND = "What the motion could not show", "Work it out"
-REACH, ASK_REACH = "What it can still reach", "Show in the scene"
+REACH, ASK_REACH, ANGLE = "What it can still reach", "Show", "Held at [deg]"
 REACHED = "{share:.0%} of the usual workspace with {motor} held at {angle}"
 ALL_REACHED = "{share:.0%} of the usual workspace"
 LIFE, ASK_LIFE = "Remaining life", "Estimate"

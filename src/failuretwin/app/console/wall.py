@@ -6,8 +6,8 @@ from typing import Any
 
 from nicegui import ui
 
-from failuretwin.app.console import texts
-from failuretwin.app.console.layout import COLOURS, Visit, page, text
+from failuretwin.app.console import draw, texts
+from failuretwin.app.console.layout import COLOURS, Visit, page
 
 PERIOD_S = 1.0
 """Time between two updates [s]."""
@@ -53,7 +53,8 @@ def show(visit: Visit) -> None:
     """Draw the page."""
     with page(visit, texts.WALL):
         ui.add_css(STYLE)
-        trouble = text("").props('role="alert"')
+        trouble = draw.alert("")
+        note = draw.text("").props('role="status"')
         wall = Wall()
         ready = False
 
@@ -61,6 +62,7 @@ def show(visit: Visit) -> None:
             if not ready:
                 return
             trouble.set_text(visit.desk.trouble)
+            note.set_text(visit.desk.note)
             wall.show({tile.name: tile.record() for tile in visit.desk.tiles()})
 
         def begin() -> None:
