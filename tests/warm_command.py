@@ -1,13 +1,14 @@
 """The command line in a process of its own, without waiting for its imports each time.
 
-A server imports the package and its libraries once and forks for every call. What a call says goes
-to files, so that it has no terminal, as with pipes.
+A server imports the package and its libraries once, loads what is compiled, and forks for every
+call. What a call says goes to files, so that it has no terminal, as with pipes.
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
+import gc
 import importlib
 import json
 import os
@@ -88,6 +89,9 @@ def serve():
     """Answer calls, a line each, with exit codes, until there are no more."""
     for library in WARM:
         importlib.import_module(library)
+    _load_what_is_compiled()
+    gc.collect()
+    gc.freeze()
     for line in sys.stdin:
         call = json.loads(line)
         child = os.fork()
@@ -98,6 +102,12 @@ def serve():
         _, status = os.waitpid(child, 0)
         late.cancel()
         print(os.waitstatus_to_exitcode(status), flush=True)
+
+
+def _load_what_is_compiled():
+    """Call each kind of compiled loop once: loading their code takes seconds."""
+    failuretwin = importlib.import_module("failuretwin")
+    failuretwin.diagnose(failuretwin.sample_log())
 
 
 def _become(call):
