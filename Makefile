@@ -10,6 +10,7 @@ demo: .venv/demo
 	$(BIN)/python examples/demo.py
 
 test: .venv/ready lint
+	@$(BIN)/python -m compileall -q src  # for processes that are told to write no bytecode
 	@$(BIN)/python -c "import failuretwin as ft; ft.diagnose(ft.sample_log())"  # compiles the engine once
 	$(BIN)/pytest -m "not slow" --numprocesses 2 --dist loadfile
 
