@@ -3,6 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Small arrays gain nothing from threads, and threads of several processes get in each other's way.
 export OMP_NUM_THREADS ?= 1
+# Hundreds of processes of the tests import the package: it is compiled once, not by each.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo fleet test docs links notebooks pages wheel bench calibrations lint format clean
 
@@ -10,7 +12,6 @@ demo: .venv/demo
 	$(BIN)/python examples/demo.py
 
 test: .venv/ready lint
-	@$(BIN)/python -m compileall -q src  # for processes that are told to write no bytecode
 	@$(BIN)/python -c "import failuretwin as ft; ft.diagnose(ft.sample_log())"  # compiles the engine once
 	$(BIN)/pytest -m "not slow" --numprocesses 2 --dist loadfile
 
