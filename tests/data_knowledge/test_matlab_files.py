@@ -17,7 +17,9 @@ def cells(data, armpi, tmp_path_factory):
     """Every tenth of the 90 published cells, in a file of its own: a run of each class."""
     whole = scipy.io.loadmat(data / "processed_samples" / "cell_array_20241003.mat")
     path = tmp_path_factory.mktemp("cells") / "cell_array_20241003.mat"
-    scipy.io.savemat(path, {name: whole[name][:, ::10] for name in ("X_test_array", "y_test_array")})
+    scipy.io.savemat(
+        path, {name: whole[name][:, ::10] for name in ("X_test_array", "y_test_array")}
+    )
     return read_runs(path, armpi)
 
 

@@ -112,7 +112,7 @@ def test_modes_without_a_law_are_unknown(twin, armpi, monkeypatch):
     assert np.mean([d.diagnosis == "unknown" for d in found]) >= 0.8
 
 
-@pytest.mark.parametrize("every", [12, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [4, pytest.param(2, marks=pytest.mark.slow)])
 def test_known_faults_stay_known(twin, either, imperfect, every):
     """Offering `unknown` turns hardly any right diagnosis: 1.7 % of 900 (docs/inference.md)."""
     some = imperfect.isel(run=slice(None, None, every))
