@@ -39,6 +39,8 @@ WARM = (
     *("pyarrow.dataset", "pyarrow.parquet", "sqlalchemy.dialects.sqlite", "zarr"),
     "failuretwin.data_knowledge.records.store",
 )
+DASK_METHOD = "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD"
+"""Of a fork server, workers of a command import Dask together; spawned, each by itself."""
 LIMIT_S = 120.0
 DISK_BYTES = 500
 
@@ -52,7 +54,7 @@ class WarmCommand:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            env={**os.environ, "OMP_NUM_THREADS": "1", DASK_METHOD: "forkserver"},
         )
 
     def run(self, *arguments, folder=None, disk_full=False):
