@@ -37,7 +37,8 @@ WARM = (
     ),
     *("alembic.command", "dask.array", "distributed", "matplotlib.pyplot", "mujoco"),
     *("pyarrow.dataset", "pyarrow.parquet", "sqlalchemy.dialects.sqlite", "zarr"),
-    "failuretwin.data_knowledge.records.store",
+    *("failuretwin.app.inputs", "failuretwin.app.learning", "failuretwin.data_knowledge.resumable"),
+    *("failuretwin.app.reports.isolability_report", "failuretwin.data_knowledge.records.store"),
 )
 DASK_METHOD = "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD"
 """Of a fork server, workers of a command import Dask together; spawned, each by itself."""
