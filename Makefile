@@ -3,6 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Small arrays gain nothing from threads, and threads of several processes get in each other's way.
 export OMP_NUM_THREADS ?= 1
+# Hundreds of processes of the tests import the package: it is compiled once, not by each.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo fleet test docs links notebooks pages wheel bench calibrations lint format clean
 

@@ -38,7 +38,7 @@ def test_sound_files_of_every_kind_are_read(sound):
 
 
 def test_some_broken_files_of_every_kind(sound, tmp_path):
-    judge(cases(75, SEED, QUICK), sound, tmp_path)
+    judge(cases(45, SEED, QUICK), sound, tmp_path)
 
 
 @pytest.mark.slow

@@ -17,11 +17,6 @@ import executed
 import notebooks
 
 ROOT = Path(__file__).parents[1]
-QUICK = "diagnose_a_log"
-EACH_TUTORIAL = [
-    pytest.param(name, marks=() if name == QUICK else pytest.mark.slow)
-    for name in notebooks.TUTORIALS
-]
 
 
 def run(page):
@@ -91,7 +86,8 @@ def test_notebooks_match_their_tutorials(name):
     assert written == notebooks.text_of(name), "python docs/notebooks.py"
 
 
-@pytest.mark.parametrize("name", EACH_TUTORIAL)
+@pytest.mark.slow  # in Jupyter; each matches its tutorial, which is run as a page
+@pytest.mark.parametrize("name", notebooks.TUTORIALS)
 def test_a_notebook_runs(name, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:/usr/bin:/bin")
     monkeypatch.setenv("PYTHONWARNINGS", "default")

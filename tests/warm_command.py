@@ -1,13 +1,14 @@
 """The command line in a process of its own, without waiting for its imports each time.
 
-A server imports the package and its libraries once and forks for every call. What a call says goes
-to files, so that it has no terminal, as with pipes.
+A server imports the package and its libraries once, loads what is compiled, and forks for every
+call. What a call says goes to files, so that it has no terminal, as with pipes.
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
+import gc
 import importlib
 import json
 import os
@@ -36,8 +37,11 @@ WARM = (
     ),
     *("alembic.command", "dask.array", "distributed", "matplotlib.pyplot", "mujoco"),
     *("pyarrow.dataset", "pyarrow.parquet", "sqlalchemy.dialects.sqlite", "zarr"),
-    "failuretwin.data_knowledge.records.store",
+    *("failuretwin.app.inputs", "failuretwin.app.learning", "failuretwin.data_knowledge.resumable"),
+    *("failuretwin.app.reports.isolability_report", "failuretwin.data_knowledge.records.store"),
 )
+DASK_METHOD = "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD"
+"""Of a fork server, workers of a command import Dask together; spawned, each by itself."""
 LIMIT_S = 120.0
 DISK_BYTES = 500
 
@@ -51,7 +55,7 @@ class WarmCommand:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            env={**os.environ, "OMP_NUM_THREADS": "1", DASK_METHOD: "forkserver"},
         )
 
     def run(self, *arguments, folder=None, disk_full=False):
@@ -88,6 +92,9 @@ def serve():
     """Answer calls, a line each, with exit codes, until there are no more."""
     for library in WARM:
         importlib.import_module(library)
+    _load_what_is_compiled()
+    gc.collect()
+    gc.freeze()
     for line in sys.stdin:
         call = json.loads(line)
         child = os.fork()
@@ -98,6 +105,12 @@ def serve():
         _, status = os.waitpid(child, 0)
         late.cancel()
         print(os.waitstatus_to_exitcode(status), flush=True)
+
+
+def _load_what_is_compiled():
+    """Call each kind of compiled loop once: loading their code takes seconds."""
+    failuretwin = importlib.import_module("failuretwin")
+    failuretwin.diagnose(failuretwin.sample_log())
 
 
 def _become(call):

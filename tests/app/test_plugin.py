@@ -83,12 +83,12 @@ def test_the_command_line_knows_it(failuretwin, folder):
     assert one == two
     offered = "healthy,motor_2:bent_shaft,motor_2:stuck,motor_2:steady_state_error"
     options = ("--plugin", "bent_shaft", "--hypotheses", offered, "--json", "said.jsonl")
-    save_run_set(load_run_set(folder / "one.zarr").isel(run=slice(29, 44)), folder / "some.nc")
+    save_run_set(load_run_set(folder / "one.zarr").isel(run=slice(32, 38)), folder / "some.nc")
     answer = failuretwin("diagnose", "some.nc", *options, folder=folder)
     assert answer.stderr == ""
     said = [json.loads(line) for line in (folder / "said.jsonl").read_text().splitlines()]
     bent = [s for s in said if s["truth"] == s["diagnosis"] == "motor_2:bent_shaft"]
-    assert len(bent) >= 8
+    assert len(bent) >= 3
     assert bent[0]["verdict"].startswith("motor 2 bent shaft (")
     assert bent[0]["magnitude_unit"] == "rad"
     score = failuretwin("evaluate", "said.jsonl", "--plugin", "bent_shaft", folder=folder)

@@ -153,7 +153,7 @@ def shares(watched):
     return of["motor_3"] / sum(of.values()), of["motor_4"] / sum(of.values())
 
 
-@pytest.mark.parametrize("motor", [2, 3])
+@pytest.mark.parametrize("motor", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_two_motors_that_are_suspected_are_told_apart_and_the_arm_is_back(known, motor):
     watched = watched_arm(known, motor).until(LAST_S + 5.0)
     assert watched.alarm.state != CLEAR

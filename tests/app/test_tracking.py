@@ -13,7 +13,7 @@ from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.inference.together.life_filter import WINDOW
 from failuretwin.inference.together.wear_limits import WearLimits
 
-RUNS = 32
+RUNS = 24
 AMONG = ("--hypotheses", "healthy,motor_1:stuck,motor_2:steady_state_error")
 """Where what is learned does not depend on what else is offered."""
 
@@ -83,7 +83,7 @@ def test_runs_are_tracked_and_the_history_kept(failuretwin, calibration, healthy
     answer = failuretwin("diagnose", healthy, *told)
     assert answer.returncode == 0, answer.stderr
     line = answer.stdout.splitlines()[-1]
-    assert line.startswith("tracked: 32 runs learned, 32 in all; largest changes: bias of motor_")
+    assert line.startswith("tracked: 24 runs learned, 24 in all; largest changes: bias of motor_")
     rows = rows_of(calibration)
     records = [json.loads(text) for text in (tmp_path / "x.jsonl").read_text().splitlines()]
     assert [row["run"] for row in rows] == [record["run"] for record in records]
@@ -200,7 +200,7 @@ def test_a_life_may_begin_cold_and_go_on(failuretwin, healthy, tmp_path):
     for path, rows in zip(parts, (slice(0, 6), slice(6, 14)), strict=True):
         save_run_set(runs.isel(run=rows), path)
     for part, learned in zip(parts, (6, 14), strict=True):
-        answer = failuretwin("diagnose", part, "--track", "--out", out, "--json", file)
+        answer = failuretwin("diagnose", part, "--track", "--out", out, "--json", file, *AMONG)
         assert answer.returncode == 0, answer.stderr
         assert f"{learned} in all" in answer.stdout
     records = [json.loads(text) for text in file.read_text().splitlines()]

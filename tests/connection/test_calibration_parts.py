@@ -456,7 +456,7 @@ def test_no_payload_is_told_where_there_is_none(settle, armpi):
 
 def test_a_heavy_payload_on_a_precise_arm_is_told(settle, armpi):
     loaded = replace(TYPICAL, compliance=(0.0, 0.05, 0.05, 0.05), scatter=(3e-4,) * 4, payload=0.5)
-    seen = settle(loaded, seed=10, movements=100, readings=False)
+    seen = settle(loaded, seed=10, movements=50, readings=False)
     payload, told = best_payload(fit_settling(seen), armpi)
     assert payload == 0.5
     assert "about 0.5 kg at the tool point" in told

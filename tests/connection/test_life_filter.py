@@ -206,7 +206,7 @@ def test_wear_is_followed_and_the_doubt_is_honest(armpi):
     assert np.ptp(swing, axis=0).max() > 1.5 * COUNT  # it is worth following
 
 
-@pytest.mark.parametrize("counts", [5.0, -8.0, 30.0])
+@pytest.mark.parametrize("counts", [5.0, pytest.param(-8.0, marks=pytest.mark.slow), 30.0])
 def test_a_sudden_fault_that_the_diagnosis_misses_is_not_absorbed(armpi, counts):
     """All runs are taken for healthy; only what they change can tell.
 
@@ -225,7 +225,9 @@ def test_a_sudden_fault_that_the_diagnosis_misses_is_not_absorbed(armpi, counts)
     assert any(alarms[10 : 17 if outlier else 14])
 
 
-@pytest.mark.parametrize(("pace", "runs"), [(0.05, 400), (0.5, 100)])
+@pytest.mark.parametrize(
+    ("pace", "runs"), [pytest.param(0.05, 400, marks=pytest.mark.slow), (0.5, 100)]
+)
 def test_a_fault_that_grows_is_not_absorbed(armpi, pace, runs):
     """It is taken for wear until it stands out; then learning stops, however far it goes."""
     wear = np.concatenate([truth(200), truth(runs, motor_2(pace * np.arange(runs)))])

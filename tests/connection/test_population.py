@@ -361,12 +361,12 @@ AMONG = ["healthy", *TRUTHS, "motor_3:stuck", "motor_4:stuck"]
 
 
 def test_strangers_of_a_fleet_are_judged_better_than_by_their_class(armpi):
-    """Three of a fleet, of each two runs of three movements; twelve others are calibrated."""
+    """Two of a fleet, of each two runs of three movements; twelve others are calibrated."""
     rng = np.random.default_rng(0)
     known = [replace(vary(FLEET, rng), name=f"robot {i}") for i in range(12)]
     population = ft.Population.fit(known, armpi)
     scores = {"fleet": [], "class": []}
-    for seed in range(6, 9):
+    for seed in (6, 7):
         runs = simulate(Plan(armpi, TRUTHS, 1, seed, vary(FLEET, rng), RandomMovements(count=3)))
         for name, prior in (("fleet", population), ("class", None)):
             found = SelfCalibratingDiagnoser(armpi, prior, hypotheses=AMONG).diagnose(runs)

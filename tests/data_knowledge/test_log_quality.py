@@ -151,13 +151,14 @@ def test_a_clean_log_has_no_defects(clean):
 
 
 @pytest.mark.parametrize("name", NAMED)
-def test_a_defect_is_named(clean, twin, name):
+def test_a_defect_is_named_and_no_healthy_arm_looks_surely_faulty(clean, twin, name):
     spoil, words = NAMED[name]
     (diagnosis,) = BayesDiagnoser(twin).diagnose(spoil(clean))
 
     text = "; ".join(diagnosis.quality)
     for part in words:
         assert part in text
+    assert diagnosis.diagnosis in ("healthy", None) or diagnosis.posterior["healthy"] > 0.1
 
 
 @pytest.mark.parametrize("name", WITHOUT_EVIDENCE)
@@ -176,13 +177,6 @@ def test_a_log_without_rests_is_judged_on_the_way(clean, twin):
 
     assert diagnosis.diagnosis == "healthy"
     assert diagnosis.method.startswith("bayes, readings on the way")
-
-
-def test_a_spoilt_log_never_makes_a_healthy_arm_look_surely_faulty(clean, twin):
-    for spoil, _ in NAMED.values():
-        (diagnosis,) = BayesDiagnoser(twin).diagnose(spoil(clean))
-        faulty = 1.0 - diagnosis.posterior["healthy"]
-        assert diagnosis.diagnosis in ("healthy", None) or faulty < 0.9
 
 
 def test_a_noisy_sensor_that_stands_still_says_nothing_of_the_arm(clean, twin):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -21,11 +22,14 @@ def measured(places):
     return Normal(precision, places / NOISE**2)
 
 
+@cache
+def of_one_robot(count):
+    """Measurements of one robot, theta standard normal: by scipy."""
+    return stats.multivariate_normal(cov=np.ones((count, count)) + NOISE**2 * np.eye(count))
+
+
 def log_density(places):
-    """Log density of measurements of one robot, theta standard normal: by scipy."""
-    count = len(places)
-    covariance = np.ones((count, count)) + NOISE**2 * np.eye(count)
-    return sum(stats.multivariate_normal(cov=covariance).logpdf(x) for x in places.T)
+    return of_one_robot(len(places)).logpdf(places.T).sum()
 
 
 def gain(places, part):

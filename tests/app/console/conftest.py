@@ -14,6 +14,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
+    """A console with a robot at work, which would keep a core busy while other files are tested."""
     made = ConsoleServer(tmp_path_factory.mktemp("console"))
     yield made
     made.stop()
