@@ -29,7 +29,7 @@ HEADLINES = {
     "transfer": "correct [%]",
     "cold": "correct [%]",
     "moving": "correct [%]",
-    "set_up": "motor blamed above 95 % [%]",
+    "set_up": "a wrong motor blamed above 95 % [%]",
     "real": "correct [%]",
 }
 """The figure of each task that the short table shows."""
