@@ -98,14 +98,19 @@ def fit_frames(
         return np.asarray(((seen - placed) * 1e3).ravel())
 
     tool = np.array([0.0, 0.0, least_squares(residual, start, loss="soft_l1").x[8]])
-    base = least_squares(lambda p: residual(np.r_[p, tool]), start[:6], loss="soft_l1").x
+
+    def of_base(p: FloatArray) -> FloatArray:
+        return residual(np.r_[p, tool])
+
+    base = least_squares(of_base, start[:6], loss="soft_l1").x
     rms = float(np.sqrt(np.mean(residual(np.r_[base, tool]) ** 2) * 3))
     return Rotation.from_rotvec(base[:3]), base[3:6], tool, rms
 
 
 def urdf(arm: str, tool: FloatArray) -> str:
     """Return the arm with its tool as URDF."""
-    lines, parent, xyz, roll = [f'<robot name="{arm}"><link name="base"/>'], "base", (0, 0, 0), 0.0
+    lines, parent, roll = [f'<robot name="{arm}"><link name="base"/>'], "base", 0.0
+    xyz: tuple[float, float, float] = (0, 0, 0)
     for j, (a, d, alpha) in enumerate(zip(*ARMS[arm], strict=True), 1):
         lines.append(
             f'<link name="link_{j}"/><joint name="joint_{j}" type="revolute">'
