@@ -3,9 +3,9 @@
     FAILURETWIN_DATA=DATA python benchmarks/real_arms.py [--arms ur10 ur5] [--seeds 0]
         [--per-cell 6] [--healthy 60] [--raw]
 
-DATA/real_arms holds measured poses of healthy arms, DATA/../real_arms/relabel.py makes runs with
-known faults of them ("relabelled real": the measurements stay, the claimed commands change). Each
-arm has the profile that `failuretwin robot init` writes, untouched. Its runs are judged without a
+DATA/real_arms holds measured poses of healthy arms (docs/data.md). relabel.py makes runs with known
+faults of them ("relabelled real": the measurements stay, the claimed commands change). Each arm has
+the profile that `failuretwin robot init` writes, untouched. Its runs are judged without a
 calibration, in folders of fifty that calibrate themselves, with the calibration that `failuretwin
 calibrate` learns from other poses, and with the one that it learns with the geometry that
 `failuretwin robot fit` finds from those poses; the UR10 also judges healthy runs of the same robot
@@ -16,9 +16,9 @@ fit` on 40 poses comes first.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import csv
 import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import relabel
 
 import failuretwin as ft
 from failuretwin.connection.registration.fit import fit_registration
@@ -86,35 +87,31 @@ def main() -> None:
     parser.add_argument("--healthy", type=int, default=60, help="healthy runs")
     parser.add_argument("--raw", action="store_true", help="positions in the tracker's own frame")
     options = parser.parse_args()
-    script, poses = _data()
+    poses = _data()
     for arm in options.arms:
         for seed in options.seeds:
             with tempfile.TemporaryDirectory() as folder:
                 out, counts = Path(folder), (options.per_cell, options.healthy)
                 if options.raw:
-                    _raw_arm(script, poses, arm, seed, counts, out)
+                    _raw_arm(poses, arm, seed, counts, out)
                 else:
-                    _arm(script, poses, arm, seed, counts, out)
+                    _arm(poses, arm, seed, counts, out)
 
 
-def _data() -> tuple[Path, Path]:
-    """Return the script that makes runs, and the folder with measured poses."""
-    data = Path(os.environ.get("FAILURETWIN_DATA", "data"))
-    script, poses = data.resolve().parent / "real_arms" / "relabel.py", data / "real_arms"
-    for path in (script, poses):
-        if not path.exists():
-            sys.exit(
-                f"{path} is not there. Set FAILURETWIN_DATA to the folder that holds real_arms "
-                "with measured poses, beside which real_arms/relabel.py lies."
-            )
-    return script, poses
+def _data() -> Path:
+    """Return the folder with measured poses."""
+    poses = Path(os.environ.get("FAILURETWIN_DATA", "data")) / "real_arms"
+    if not poses.is_dir():
+        sys.exit(
+            f"{poses} is not there. Set FAILURETWIN_DATA to the folder that holds real_arms with "
+            "measured poses, filled as docs/data.md says."
+        )
+    return poses
 
 
-def _arm(
-    script: Path, poses: Path, arm: str, seed: int, counts: tuple[int, int], folder: Path
-) -> None:
+def _arm(poses: Path, arm: str, seed: int, counts: tuple[int, int], folder: Path) -> None:
     """Judge the runs of one arm and print the tables."""
-    runs = _relabelled(script, poses / POSES[arm], arm, seed, counts, folder / "runs")
+    runs = _relabelled(poses / POSES[arm], arm, seed, counts, folder / "runs")
     robot = _initial(runs)
     _table(f"{arm}, seed {seed}, plain", _judged(runs, robot, None))
     _table(f"{arm}, seed {seed}, self-calibrated by {FOLDER_RUNS} runs", _together(runs, robot))
@@ -124,7 +121,7 @@ def _arm(
     _table(f"{arm}, seed {seed}, calibrated", _judged(runs, robot, known))
     _table(f"{arm}, seed {seed}, calibrated with geometry", _judged(runs, fitted, exact))
     if arm in EARLIER:
-        months = (script, poses / EARLIER[arm], arm, seed, (0, counts[1]), folder / "earlier")
+        months = (poses / EARLIER[arm], arm, seed, (0, counts[1]), folder / "earlier")
         older = _relabelled(*months)
         _table(f"{arm}, seed {seed}, months before", _judged(older, robot, known))
         _table(f"{arm}, seed {seed}, months before, geometry of now", _judged(older, fitted, exact))
@@ -133,11 +130,9 @@ def _arm(
         _table(title, _judged(older, placed, exact))
 
 
-def _raw_arm(
-    script: Path, poses: Path, arm: str, seed: int, counts: tuple[int, int], folder: Path
-) -> None:
+def _raw_arm(poses: Path, arm: str, seed: int, counts: tuple[int, int], folder: Path) -> None:
     """Judge the runs of one arm in the frame of the tracker and print the tables."""
-    runs = _relabelled(script, poses / POSES[arm], arm, seed, counts, folder / "runs", "--raw")
+    runs = _relabelled(poses / POSES[arm], arm, seed, counts, folder / "runs", "--raw")
     placed = _fitted(runs, _initial(runs), "placed.toml", FIRST_RUNS)
     _table(f"{arm}, seed {seed}, raw, fitted to 40 poses", _judged(runs, placed, None))
     known = _calibrated(runs, placed)
@@ -200,7 +195,6 @@ def _together(runs: Path, robot: Robot) -> list[Scored]:
 
 
 def _relabelled(
-    script: Path,
     poses: Path,
     arm: str,
     seed: int,
@@ -211,7 +205,6 @@ def _relabelled(
     """Return the folder of runs made of measured poses.
 
     Args:
-        script: What makes them.
         poses: The measured poses.
         arm: Name of the arm.
         seed: Seed of what is drawn.
@@ -221,8 +214,8 @@ def _relabelled(
     """
     per_cell, healthy = (str(count) for count in counts)
     options = ["--seed", str(seed), "--per-cell", per_cell, "--healthy", healthy, *more]
-    command = [sys.executable, str(script), str(poses), arm, str(out), *options]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    with contextlib.redirect_stdout(None):
+        relabel.main([str(poses), arm, str(out), *options])
     return out
 
 

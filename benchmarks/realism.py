@@ -1,16 +1,24 @@
 """How like the real robot the imperfect twin is: figures side by side, and a two-sample test.
 
-    python benchmarks/realism.py HEALTHY_LOG... [--runs 500]
+    python benchmarks/realism.py HEALTHY_LOG... [--copies 10] [--robot ARM]
+        [--map MAP.toml] [--rests]
 
-A classifier that cannot tell real from simulated runs better than by tossing a coin has an area
-under the curve of 0.5. It is judged on sessions that it was not trained on.
+Each real run has simulated copies with the same targets and ramps. A classifier that cannot tell
+them apart better than by tossing a coin has an area under the curve of 0.5. It is judged on
+sessions that it was not trained on. Then come the features that tell them apart by themselves.
+A robot without a calibration is calibrated on every other run, which is then left out. With
+--rests only settled positions count, for logs that have no readings on the way.
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import xarray as xr
 from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import accuracy_score, roc_auc_score
@@ -19,57 +27,135 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 import failuretwin as ft
-from failuretwin.connection.calibration.calibrate import fit_calibration
+from failuretwin.connection.calibration.calibrate import calibrate, fit_calibration
 from failuretwin.connection.calibration.observations import observe, session_names
 from failuretwin.connection.calibration.timing_fit import movements_of
 from failuretwin.core.hypothesis import HEALTHY
-from failuretwin.core.types import FloatArray
+from failuretwin.core.movements import Movements
+from failuretwin.core.runs import concatenate
+from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.data_knowledge.readers.column_map import read_column_map
 from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.observation.evidence import settled_evidence
 
 FOLDS = 5
-MOVEMENTS = 5
+SAMPLES = 500
+"""Bootstrap samples behind each interval."""
+RIDGE_M = 1e-3
+"""Displacement of the tool that no motor explains [m]."""
+TOLD = 6
+"""Features that are printed."""
 
 
-def features(runs: object, robot: Robot) -> FloatArray:
-    """Return residual features of runs at system level, (run, feature).
+@dataclass(frozen=True)
+class SameMovements(RandomMovements):
+    """The targets and ramps of a recorded run; only the times of commands are drawn."""
 
-    Per movement: settled residual of the tool (x, y, z) [m], its residual while moving (rms) [m]
-    and the share of readings that are there.
+    initial: Any = ()
+    target: Any = ()
+    ramp: Any = ()
+
+    def draw(self, *where: Any) -> Movements:
+        """Return the movements of one run."""
+        found = super().draw(*where)
+        initial, target, ramp = (np.array([x]) for x in (self.initial, self.target, self.ramp))
+        return replace(found, initial=initial, target=target, ramp_duration=ramp)
+
+
+def copies_of(real: xr.Dataset, robot: Robot, known: Imperfections, copies: int) -> xr.Dataset:
+    """Return simulated runs with the movements of each real run."""
+    movements, made = movements_of(real), []
+    for run in range(real.sizes["run"]):
+        own = movements[run : run + 1]
+        count = int(own.exists.sum())
+        lists = [x.tolist() for x in (own.initial[0], own.target[0], own.ramp_duration[0])]
+        period = float(np.median(np.diff(own.start[0, :count])))
+        same = SameMovements(count, period, (0.5,), lists[0], lists[1][:count], lists[2][:count])
+        part = simulate(Plan(robot, [HEALTHY], copies, run, known, same))
+        names = [f"copy {run}/{copy}" for copy in range(copies)]
+        made.append(part.assign_coords(run=("run", np.array(names, dtype=object))))
+    return concatenate(made)
+
+
+def features(runs: xr.Dataset, robot: Robot) -> dict[str, FloatArray]:
+    """Return what runs show at rest, on the way and in time; by name, (run,) each.
+
+    Displacements at rest are shared out between the motors by ridge regression.
     """
-    import xarray as xr
-
-    assert isinstance(runs, xr.Dataset)
     twin, time = DigitalTwin(robot), runs["time"].values
     path = twin.path(twin.respond(runs["command"].values, time))
-    residual = runs["measured"].values - path
-    settled = settled_evidence(runs)
-    movements = movements_of(runs)
+    residual, measured = runs["measured"].values - path, runs["measured"].values
+    settled, movements = settled_evidence(runs), movements_of(runs)
+    expected, jacobian = twin.path_and_jacobian(np.nan_to_num(movements.target))
+    beyond = np.where(settled.usable[..., None], settled.point - expected, np.nan)
+    square = np.einsum("...am,...bm->...ab", jacobian, jacobian) + RIDGE_M**2 * np.eye(3)
+    turn = np.einsum("...am,...ab,...b->...m", jacobian, np.linalg.inv(square), beyond)
+    towards = np.sign(movements.target - movements.origin())
+    names = robot.motor_names
     rows = []
-    for run in range(runs.sizes["run"]):
-        row: list[float] = []
-        for m in range(MOVEMENTS):
-            begin = movements.start[run, m]
-            end = begin + movements.ramp_duration[run, m].max()
-            moving = residual[run, (time >= begin) & (time < end)]
-            whole = residual[run, (time >= begin) & (time < begin + 2.0), 0]
-            seen = np.isfinite(moving).all(axis=1)
-            rms = np.sqrt(np.mean(moving[seen] ** 2)) if seen.any() else np.nan
-            expected = twin.path(movements.target[run, m])
-            off = settled.point[run, m] - expected if settled.usable[run, m] else [np.nan] * 3
-            row += [*off, rms, float(np.isfinite(whole).sum())]
-        rows.append(row)
-    return np.array(rows)
+    with np.errstate(invalid="ignore"):
+        for run in range(runs.sizes["run"]):
+            seen = np.isfinite(measured[run]).all(axis=1)
+            row = {"readings, share": float(seen[time <= float(runs["duration"][run])].mean())}
+            row["at rest, all [m]"] = _mean(np.linalg.norm(beyond[run], axis=1))
+            for m, name in enumerate(names):
+                row[f"at rest, {name}, mean [rad]"] = _mean(turn[run, :, m])
+                row[f"at rest, {name}, size [rad]"] = _mean(np.abs(turn[run, :, m]))
+                row[f"at rest, {name}, towards [rad]"] = _mean(turn[run, :, m] * towards[run, :, m])
+            rows.append(row | _in_time(run, residual, path, measured, time, settled, movements))
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def table(real: object, simulated: object, robot: Robot) -> None:
+def _in_time(
+    run: int,
+    residual: FloatArray,
+    path: FloatArray,
+    measured: FloatArray,
+    time: FloatArray,
+    settled: Any,
+    movements: Movements,
+) -> dict[str, float]:
+    """Return noise and settling at rest, and residual and lag on the way, of one run."""
+    seen = np.isfinite(measured[run]).all(axis=1)
+    velocity = np.gradient(path[run], time, axis=0)
+    found: dict[str, list[float]] = {key: [] for key in ("noise", "settling", "way", "lag")}
+    for m in np.flatnonzero(movements.exists[run]):
+        begin = movements.start[run, m]
+        way = seen & (time >= begin) & (time < begin + movements.ramp_duration[run, m].max())
+        rest = seen & (time >= settled.begin[run, m]) & (time <= settled.end[run, m])
+        if rest.sum() > 1 and settled.usable[run, m]:
+            found["noise"].append(float(measured[run, rest].std(axis=0).mean()))
+            moved = measured[run, rest][-1] - measured[run, rest][0]
+            found["settling"].append(float(np.linalg.norm(moved)))
+        if way.any():
+            r, v = residual[run, way], velocity[way]
+            found["way"].append(float(np.sqrt(np.mean(r**2))))
+            found["lag"].append(float(-(r * v).sum() / max((v * v).sum(), 1e-9)))
+    return {
+        "noise at rest [m]": _mean(np.array(found["noise"])),
+        "settling at rest [m]": _mean(np.array(found["settling"])),
+        "on the way, median rms [m]": _median(found["way"]),
+        "on the way, largest rms [m]": max(found["way"], default=np.nan),
+        "on the way, median lag [s]": _median(found["lag"]),
+    }
+
+
+def _mean(values: FloatArray) -> float:
+    kept = values[np.isfinite(values)]
+    return float(kept.mean()) if len(kept) else np.nan
+
+
+def _median(values: list[float]) -> float:
+    return float(np.median(values)) if values else np.nan
+
+
+def table(real: xr.Dataset, simulated: xr.Dataset, robot: Robot) -> None:
     """Print settled errors, timing and rates of both, side by side."""
-    import xarray as xr
-
-    assert isinstance(real, xr.Dataset) and isinstance(simulated, xr.Dataset)
     count = abs(robot.servo_units.rad_per_count)
     print(f"{'':44s} {'real':>9s} {'95 % interval':>20s} {'simulated':>10s}")
     errors = []
@@ -95,57 +181,86 @@ def table(real: object, simulated: object, robot: Robot) -> None:
             print(f"{name:44s} {p.value:9.4f} {p.low:9.4f} to {p.high:7.4f} {match.value:10.4f}")
 
 
-def two_sample(real: object, simulated: object, robot: Robot) -> None:
-    """Print how well classifiers tell real from simulated runs, by session."""
-    import xarray as xr
+def two_sample(
+    real: xr.Dataset, simulated: xr.Dataset, robot: Robot, copies: int, rests: bool
+) -> None:
+    """Print how well classifiers tell real from simulated runs, by session, and by which features.
 
-    assert isinstance(real, xr.Dataset) and isinstance(simulated, xr.Dataset)
+    Copies are in the fold of the run that they copy.
+    """
     sessions = session_names(real)
     names = sorted(set(sessions))
+    own = np.array([names.index(s) for s in sessions])
+    groups = np.concatenate([own, np.repeat(own, copies)])
+    y = np.repeat([1, 0], [len(own), copies * len(own)])
     a, b = features(real, robot), features(simulated, robot)
-    values_of, y = np.concatenate([a, b]), np.repeat([1, 0], [len(a), len(b)])
-    groups = [names.index(s) for s in sessions] + [i % len(names) for i in range(len(b))]
-    filled = np.where(np.isfinite(values_of), values_of, 0.0)
+    seen = {name: np.concatenate([a[name], b[name]]) for name in a}
+    if rests:
+        seen = {name: values for name, values in seen.items() if name.startswith("at rest")}
+    values = np.stack(list(seen.values()), axis=1)
+    kept = np.isfinite(values).any(axis=0)
+    values, columns = values[:, kept], np.array(list(seen))[kept]
+    filled = np.where(np.isfinite(values), values, np.nanmedian(values, axis=0))
     linear = make_pipeline(
         StandardScaler(), LogisticRegression(class_weight="balanced", max_iter=2000, C=0.1)
     )
     trees = HistGradientBoostingClassifier(class_weight="balanced", max_iter=100, random_state=0)
     folds = GroupKFold(min(FOLDS, len(names)))
-    for name, model, values in (("linear", linear, filled), ("boosted trees", trees, values_of)):
+    print(f"{len(own)} real runs of {len(names)} sessions, {copies} copies of each")
+    for title, model in (("linear", linear), ("boosted trees", trees)):
         chance = cross_val_predict(
-            model, values, y, groups=groups, cv=folds, method="predict_proba"
+            model, filled, y, groups=groups, cv=folds, method="predict_proba"
         )[:, 1]
-        weight = np.where(y == 1, len(b) / len(a), 1.0)
-        right = accuracy_score(y, chance > 0.5, sample_weight=weight)
-        area = roc_auc_score(y, chance)
-        draws = []
-        rng = np.random.default_rng(0)
-        for _ in range(500):
-            pick = np.concatenate(
-                [rng.choice(np.flatnonzero(y == k), np.sum(y == k)) for k in (0, 1)]
-            )
-            draws.append(roc_auc_score(y[pick], chance[pick]))
-        low, high = np.quantile(draws, [0.025, 0.975])
-        print(
-            f"two-sample test, {name}: area under the curve {area:.3f} (95 % interval {low:.3f} to "
-            f"{high:.3f}), balanced accuracy {right:.3f}; {len(a)} real, {len(b)} simulated runs"
-        )
+        print(f"{title}: {told_apart(y, chance, own, copies)}")
+    print("features by themselves, area under the curve; mean of real, of simulated")
+    areas = {n: roc_auc_score(y, f) for n, f in zip(columns, filled.T, strict=True)}
+    for name in sorted(areas, key=lambda n: -abs(areas[n] - 0.5))[:TOLD]:
+        means = np.nanmean(a[name]), np.nanmean(b[name])
+        print(f"  {name:36s} {areas[name]:.2f}   {means[0]:10.3g} {means[1]:10.3g}")
+
+
+def told_apart(y: IntArray, chance: FloatArray, own: IntArray, copies: int) -> str:
+    """Return balanced accuracy and area under the curve, with intervals over real runs."""
+    rng, count = np.random.default_rng(0), len(own)
+    draws = []
+    for _ in range(SAMPLES):
+        runs = rng.integers(0, count, count)
+        pick = np.concatenate([runs, *(count + runs * copies + c for c in range(copies))])
+        draws.append((_balanced(y[pick], chance[pick]), roc_auc_score(y[pick], chance[pick])))
+    low, high = np.quantile(draws, [0.025, 0.975], axis=0)
+    values = _balanced(y, chance), roc_auc_score(y, chance)
+    texts = [f"{v:.2f} ({lo:.2f} to {hi:.2f})" for v, lo, hi in zip(values, low, high, strict=True)]
+    return f"balanced accuracy {texts[0]}, area under the curve {texts[1]}"
+
+
+def _balanced(y: IntArray, chance: FloatArray) -> float:
+    weight = np.where(y == 1, np.sum(y == 0) / max(np.sum(y == 1), 1), 1.0)
+    return float(accuracy_score(y, chance > 0.5, sample_weight=weight))
 
 
 def main() -> None:
     """Compare healthy logs with simulated runs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("logs", nargs="+", help="healthy logs of the robot")
-    parser.add_argument("--runs", type=int, default=500)
+    parser.add_argument("--copies", type=int, default=10)
     parser.add_argument("--robot", default="armpi_fpv")
+    parser.add_argument("--rests", action="store_true", help="settled positions alone")
+    parser.add_argument("--map", type=Path, help="column map of the logs")
     options = parser.parse_args()
     robot = ft.load_robot(options.robot)
-    real = ft.read_runs(options.logs, robot)
-    imperfections = load_calibration(None, robot).imperfections
-    simulated = simulate(Plan(robot, [HEALTHY], options.runs, 0, imperfections))
-    table(real, simulated, robot)
-    print()
-    two_sample(real, simulated, robot)
+    how = ft.ReadOptions()
+    if options.map is not None:
+        how = replace(how, columns=read_column_map(options.map, robot))
+    real = ft.read_runs(options.logs, robot, how)
+    known = load_calibration(None, robot).imperfections
+    if known.of_class:
+        known = calibrate(real.isel(run=slice(0, None, 2)), robot, "half", "logs").imperfections
+        real = real.isel(run=slice(1, None, 2))
+    simulated = copies_of(real, robot, known, options.copies)
+    two_sample(real, simulated, robot, options.copies, options.rests)
+    if "position" in real:
+        print()
+        table(real, simulated, robot)
 
 
 if __name__ == "__main__":

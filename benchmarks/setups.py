@@ -90,15 +90,15 @@ def main() -> None:
 
 
 def _armpi() -> tuple[xr.Dataset, ft.BayesDiagnoser]:
-    _, poses = _data()
+    poses = _data()
     logs = poses.parent / "real_robot_b_20241003"
     runs = read_runs(logs, options=ReadOptions(published_labels=True))
     return runs, ft.BayesDiagnoser("armpi_fpv")
 
 
 def _ur(arm: str, folder: Path) -> tuple[xr.Dataset, ft.BayesDiagnoser]:
-    script, poses = _data()
-    made = _relabelled(script, poses / POSES[arm], arm, 0, (1, 30), folder / "runs")
+    poses = _data()
+    made = _relabelled(poses / POSES[arm], arm, 0, (1, 30), folder / "runs")
     profile = made / "arm.toml"
     profile.write_text(profile_text(check_urdf(made / "arm.urdf"), profile), encoding="utf-8")
     robot = load_robot(profile)

@@ -6,7 +6,12 @@ import pytest
 from click.testing import CliRunner
 
 from failuretwin.app.cli import cli
-from failuretwin.app.reports.benchmark_page import HEADLINES, bundled_entries, comparison_tables
+from failuretwin.app.reports.benchmark_page import (
+    HEADLINES,
+    bundled_entries,
+    comparison_tables,
+    coverage_table,
+)
 from failuretwin.core.errors import InputError
 from failuretwin.decision.benchmark.tasks import TASKS
 
@@ -41,6 +46,14 @@ def test_a_missing_recorded_set_is_named(tmp_path):
 
 def test_every_task_has_its_figure_in_the_table():
     assert set(HEADLINES) == set(TASKS)
+
+
+def test_cases_without_scores_are_counted():
+    one = {"arm": "so101", "case": "class-P0"}
+    headings = coverage_table([]).headings
+    assert headings == ["entry", "armpi_fpv, of 15", "so101, of 12", "ur5e, of 12", "panda, of 12"]
+    (row,) = coverage_table([{"method": "m", "scores": [one, one]}]).rows
+    assert row == ("m", "0", "1", "0", "0")
 
 
 def test_bundled_entries_fill_the_table():

@@ -174,3 +174,12 @@ def test_a_late_start_goes_with_a_gap_in_the_readings(runs, seen, start, late):
 def test_commands_are_whole_counts(runs):
     counts = (120.0 - np.rad2deg(runs["target"].values)) / 0.24
     np.testing.assert_allclose(counts, counts.round(), atol=1e-6)
+
+
+def test_readings_flicker(runs, armpi, measured_armpi):
+    """Noise and rounding add up: variance s^2 + 1/12 of a count squared (Sheppard, 1897)."""
+    smooth = replace(measured_armpi.readings, whole_counts=False)
+    plan = Plan(armpi, [HEALTHY], RUNS, 11, replace(measured_armpi, readings=smooth))
+    error = (runs["position"].values - simulate(plan)["position"].values) / COUNT
+    expected = armpi.servo_units.noise**2 + 1.0 / 12.0
+    assert np.nanvar(error) == pytest.approx(expected, rel=0.02)

@@ -130,7 +130,7 @@ NAMED = {
         lambda r: frozen(r, (0,), 7.0),
         ["x stands still from", "dead sensor channel"],
     ),
-    "stands still late": (lambda r: frozen(r, begin=6.0), ["the tool stands still from 5.1"]),
+    "stands still late": (lambda r: frozen(r, begin=6.0), ["the tool stands still from 6.0"]),
     "slow": (lambda r: thinned(r, 3), ["readings come at 3.3 Hz, not at 10.0 Hz"]),
     "jitter": (scattered, ["the times of the readings scatter by"]),
     "dropped": (dropped, ["times a reading or two are missing"]),

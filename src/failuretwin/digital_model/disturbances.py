@@ -41,6 +41,7 @@ class Disturbances:
         reading_time: Times of the readings, (reading,) [s].
         glitch: Raw counts of corrupted readings, NaN where sound, (reading, motor).
         noise: Noise of the tool sensor, (reading, axis) [m].
+        flicker: Noise of the motors' own readings, (reading, motor) [their deviation].
     """
 
     bias: FloatArray
@@ -58,6 +59,7 @@ class Disturbances:
     reading_time: FloatArray
     glitch: FloatArray
     noise: FloatArray
+    flicker: FloatArray
 
 
 def draw_disturbances(
@@ -77,7 +79,7 @@ def draw_disturbances(
     is_late = rng.random(movements) < timing.late_rate
     late = np.where(is_late, rng.uniform(*timing.late_s, movements), 0.0)
     late[:1] = 0.0
-    times, glitch, noise = _draw_readings(imperfections.readings, motors, duration, rng)
+    times, glitch, noise, flicker = _draw_readings(imperfections.readings, motors, duration, rng)
     return Disturbances(
         bias=np.asarray(settling.bias),
         compliance=np.asarray(settling.compliance),
@@ -94,6 +96,7 @@ def draw_disturbances(
         reading_time=times,
         glitch=glitch,
         noise=noise,
+        flicker=flicker,
     )
 
 
@@ -132,9 +135,9 @@ def _draw_scatter(
 
 def _draw_readings(
     readings: Readings | None, motors: int, duration: float, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     if readings is None:
-        return np.empty(0), np.empty((0, motors)), np.empty((0, 3))
+        return np.empty(0), np.empty((0, motors)), np.empty((0, 3)), np.empty((0, motors))
     count = int(np.floor(duration * readings.rate_hz)) + 1
     times = np.arange(count) / readings.rate_hz
     times[1:] += rng.normal(0.0, readings.jitter_s, count - 1) if readings.jitter_s else 0.0
@@ -143,7 +146,8 @@ def _draw_readings(
     noise = np.zeros((count, 3))
     if readings.noise_m:
         noise = rng.normal(0.0, readings.noise_m, (count, 3))
-    return np.maximum.accumulate(times), glitch, noise
+    flicker = rng.spawn(1)[0].standard_normal((count, motors))  # leaves all other chance as it is
+    return np.maximum.accumulate(times), glitch, noise, flicker
 
 
 def delay_commands(movements: Movements, late: FloatArray) -> Movements:
@@ -218,7 +222,7 @@ def sense(
     read = _at_times(position, time, chance.reading_time)
     if readings.whole_counts:
         units = twin.robot.servo_units
-        read = units.to_rad(np.round(units.to_counts(read)))
+        read = units.to_rad(np.round(units.to_counts(read) + units.noise * chance.flicker))
     missing = _in_gap(chance, movement_start)
     if readings.drawn_out:
         return _draw_out(twin, read, chance, missing, time)

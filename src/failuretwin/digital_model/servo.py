@@ -203,21 +203,24 @@ class ServoUnits:
         deg_per_count: Degrees per count; positive means that counts run against the angle.
         low: Smallest valid count.
         high: Largest valid count.
+        noise: Standard deviation of a reading before it is rounded [counts].
     """
 
     zero_deg: float
     deg_per_count: float
     low: float
     high: float
+    noise: float = 0.0
 
     def __post_init__(self) -> None:
-        values = (self.zero_deg, self.deg_per_count, self.low, self.high)
+        values = (self.zero_deg, self.deg_per_count, self.low, self.high, self.noise)
         sane = all(abs(value) <= LARGEST_SCALE for value in values)  # which NaN is not
+        sane = sane and self.noise >= 0.0
         if not sane or self.deg_per_count == 0.0 or not self.low < self.high:
             raise InputError(
                 f"servo_units are zero_deg {values[0]:g}, deg_per_count {values[1]:g}, low "
-                f"{values[2]:g}, high {values[3]:g}. Expected low below high, a count that is not "
-                f"0 deg, and nothing beyond {LARGEST_SCALE:g}."
+                f"{values[2]:g}, high {values[3]:g}, noise {values[4]:g}. Expected low below high, "
+                f"a count that is not 0 deg, noise from 0, and nothing beyond {LARGEST_SCALE:g}."
             )
 
     @property

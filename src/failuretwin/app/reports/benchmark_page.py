@@ -11,10 +11,10 @@ from typing import Any
 from failuretwin.app.reports.plots import render_page
 from failuretwin.app.terminal import Table
 from failuretwin.data_knowledge.store import write_text
-from failuretwin.decision.benchmark.entries import BASELINES
 from failuretwin.decision.benchmark.real import real_sets
-from failuretwin.decision.benchmark.simulated import SETS, VERSION
-from failuretwin.decision.benchmark.tasks import CASES, TASKS, TRACKS
+from failuretwin.decision.benchmark.runner import REAL_ARM
+from failuretwin.decision.benchmark.simulated import ARMS, SETS, VERSION
+from failuretwin.decision.benchmark.tasks import CASES, REAL, TASKS, TRACKS
 
 Entry = Mapping[str, Any]
 
@@ -29,7 +29,7 @@ HEADLINES = {
     "transfer": "correct [%]",
     "cold": "correct [%]",
     "moving": "correct [%]",
-    "set_up": "motor blamed above 95 % [%]",
+    "set_up": "a wrong motor blamed above 95 % [%]",
     "real": "correct [%]",
 }
 """The figure of each task that the short table shows."""
@@ -82,6 +82,19 @@ def comparison_tables(entries: Sequence[Entry]) -> list[Table]:
     return tables
 
 
+def coverage_table(entries: Sequence[Entry]) -> Table:
+    """Return how many cases of each arm an entry has scores for."""
+    scored = {case for task in TASKS.values() for case in task.cases}
+    arms = [(arm, [c for c in scored if CASES[c].test != REAL or arm == REAL_ARM]) for arm in ARMS]
+    rows = []
+    for entry in entries:
+        found = {(score["arm"], score["case"]) for score in entry["scores"]}
+        counts = [sum((arm, case) in found for case in cases) for arm, cases in arms]
+        rows.append((_name(entry), *map(str, counts)))
+    headings = ["entry", *(f"{arm}, of {len(cases)}" for arm, cases in arms)]
+    return Table(headings, rows, "l" + "r" * len(arms))
+
+
 def bundled_entries() -> list[dict[str, Any]]:
     """Return the results of the entries that come with the package."""
     text = (files("failuretwin.decision.benchmark") / "baselines.json").read_text("utf-8")
@@ -102,11 +115,10 @@ def write_benchmark_page(entries: Sequence[Entry], folder: Path) -> Path:
         "benchmark": VERSION,
         "tables": comparison_tables(every),
         "details": [(_name(entry), score_table(entry)) for entry in every],
+        "coverage": coverage_table(every),
         "tracks": Table(("track", "what may be used"), list(TRACKS.items())),
         "sets": Table(("set", "content", "runs per hypothesis"), sets),
         "real": Table(("set", "content", "source", "licence"), real),
-        "cases": len(CASES),
-        "baselines": ", ".join(BASELINES),
     }
     path = folder / "index.html"
     folder.mkdir(parents=True, exist_ok=True)
