@@ -64,11 +64,12 @@ ZONE_COOKIE = (
     f"';path=/;SameSite=Strict;max-age={YEAR_S}'</script>"
 )
 RELOAD = (
-    "<script>{let was=false;setInterval(async()=>{if(window.socket?.connected)was=true;"
-    f"else if(was)try{{await fetch('{ALIVE}');location.reload()}}catch{{}}}},3000)}}</script>"
+    "<script>{let was=false,n=0;setInterval(async()=>{if(window.socket?.connected)was=true;"
+    f"else if(++n%12===0&&(was||n>=120))try{{await fetch('{ALIVE}');location.reload()}}catch{{}}"
+    "},250)}</script>"
 )
-"""Loads a page again that lost its server, once that answers; without a session it leads to the
-login."""
+"""Loads a page again that lost its server, or found none for 30 s, once that answers; without a
+session it leads to the login."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from failuretwin.app.live import troubles_of
 from failuretwin.app.shadow import Changes, Shadow
 from failuretwin.app.watch_keeper import WatchKeeper
 from failuretwin.connection.links.base import OK, Answer, Item, Sink, Source
-from failuretwin.connection.links.statuses import UNDECIDED, statuses
+from failuretwin.connection.links.statuses import BEFORE, UNDECIDED, statuses
 from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.foreign import printable
 from failuretwin.decision.streaming.fleet import MOVEMENTS, SILENCE_S
@@ -197,6 +197,8 @@ class LiveRobot(Sink):
     def _tile(self, shadow: Shadow, word: str, message: str) -> Tile:
         own, alarm = self.settings, shadow.snapshot.answer.alarm
         state, said = STATES[word], message
+        if message.startswith(BEFORE):
+            said = texts.LAST_WORD.format(said=message.removeprefix(BEFORE))
         waiting = shadow.snapshot.answer.diagnosis is None
         if waiting and self._heard is not None and word == "STALE":
             silent = (datetime.now(UTC) - self._heard).total_seconds() > SILENCE_S

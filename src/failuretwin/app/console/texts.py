@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 TITLE = "failuretwin console"
-WALL, HISTORY, CHECK, IMPORT, ROBOT, REPLAY = (
+WALL, HISTORY, CHECK, IMPORT, REPLAY = (
     "Robots",
     "History",
     "Check",
     "Import a log",
-    "Robot",
     "Replay",
 )
 SKIP = "Skip to content"

@@ -25,6 +25,8 @@ LEVEL_OK, LEVEL_WARN, LEVEL_ERROR, LEVEL_STALE = range(4)
 STATES = {CLEAR: "OK", SUSPECTED: "SUSPECTED", RAISED: "ALARM"}
 """Word for each state of an alarm."""
 UNDECIDED = "UNDECIDED"
+BEFORE = "no data for a while; before that: "
+"""Begin of the message of a robot that fell silent."""
 LEVELS = {
     "OK": LEVEL_OK,
     "SUSPECTED": LEVEL_WARN,
@@ -81,8 +83,7 @@ def statuses(answer: Answer, motors: Sequence[str]) -> list[Status]:
         current = [_arm(diagnosis, alarm), *(_motor(diagnosis, alarm, motor) for motor in motors)]
     if answer.state != STALE:
         return current
-    before = "no data for a while; before that: "
-    return [Status(s.name, STALE, before + s.message, s.values) for s in current]
+    return [Status(s.name, STALE, BEFORE + s.message, s.values) for s in current]
 
 
 def is_sure(diagnosis: Diagnosis) -> bool:
