@@ -259,7 +259,11 @@ class EmulatedArm(PacedSource):
         self._next_reading += count / readings.rate_hz
         at = np.clip(first + chance.reading_time[:count], STEP_S, length)
         return replace(
-            chance, reading_time=at, glitch=chance.glitch[:count], noise=chance.noise[:count]
+            chance,
+            reading_time=at,
+            glitch=chance.glitch[:count],
+            noise=chance.noise[:count],
+            flicker=chance.flicker[:count],
         )
 
     def _injection(self, begin_s: float, end_s: float) -> Injection:
