@@ -29,7 +29,7 @@ COVERED = {
     "backlash": 45,
     "torque_loss": 31,
     "lag": 48,
-    "slow": 43,
+    "slow": 46,
     "lost_commands": 45,
     "intermittent": 46,
 }
