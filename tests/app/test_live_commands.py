@@ -64,7 +64,7 @@ def test_an_alarm_that_is_raised_early_is_told_as_an_alarm_and_again_when_it_is_
     answer = failuretwin("watch", "emulated", "--speed", 0, "--seconds", 25, *fault)
     assert answer.returncode == 0, answer.stderr
     early, sure = [text for _, text in told(answer) if text.startswith("ALARM: ")]
-    assert "71 % (or healthy 29 %)" in early
+    assert "61 % (or healthy 39 %)" in early
     assert early.endswith("alarm threshold 57 %, by --false-alarms-per-100h")
     assert sure.startswith("ALARM: motor 3 stuck at -20 deg")
 
