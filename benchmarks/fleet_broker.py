@@ -486,7 +486,7 @@ class Interrupted:
         if kind == "SIGSTOP":
             self.workers[name] = self._paused = victim
         else:
-            victim.wait(60)
+            victim.wait(120)  # it gives its partitions 60 s
             self._start()
 
 
