@@ -25,7 +25,7 @@ from selenium.webdriver.common.keys import Keys
 SICK, LIVE, SILENT = "hall_2-arm_7", "hall_1-arm_2", "hall_1-arm_3"
 PICTURES = os.environ.get("FAILURETWIN_PICTURES")
 """Folder for the pictures of README and docs; empty: none are taken."""
-LONGEST_S = 60.0
+LONGEST_S = 180.0
 
 
 class Person:
