@@ -116,8 +116,8 @@ class Variation(Bounded):
 
     Attributes:
         bias: Standard deviation of the constant error [rad].
-        compliance: Standard deviation of the compliance in its mean [-]: log-normal, c exp(u z -
-            u^2 / 2) with u^2 = log(1 + s^2) of mean c, share s and standard normal z.
+        compliance: Standard deviation of the compliance, as a share s of its mean c [-]. It is
+            log-normal: c exp(u z - u^2 / 2), u^2 = log(1 + s^2), with a standard normal z.
         friction: Standard deviation of the friction [rad].
         scatter: Standard deviation of the scatter's logarithm [-].
         rates: Standard deviation of the logarithm of every rate of losses, late starts and glitches

@@ -186,7 +186,7 @@ def test_a_fault_arrives_live(person):
     person.sees("motor 3 stuck", "alarm number 1", "Probability over time", "nats for motor 3")
     person.find("//canvas")
     person.picture("console_robot")
-    person.press("//button[starts-with(normalize-space(), 'movement ')]")
+    person.press("//a[starts-with(normalize-space(), 'movement ')]")
     person.sees("Replay: ", "Angles")
 
 

@@ -55,6 +55,7 @@ table.plain th, table.plain td { text-align: left; padding: .25rem .6rem; vertic
 .short { width: 7rem; }
 .chart { height: 14rem; }
 .reason { text-align: left; white-space: normal; }
+a.reason { display: block; }
 .scroll { overflow: auto; max-height: 24rem; }
 .soft { opacity: .85; font-size: .9rem; }
 :focus-visible { outline: 3px solid #d98e00; outline-offset: 2px; }

@@ -23,16 +23,16 @@ MOVEMENT = re.compile(r"movement (\d+)\b")
 
 
 def reasons(
-    diagnosis: Diagnosis, trace: Trace, robot: Robot, go_to: Callable[[float], None]
+    diagnosis: Diagnosis, trace: Trace, robot: Robot, movement: Callable[[str, float], object]
 ) -> None:
-    """Draw why, and what to do now; a click on a movement goes to its time [s]."""
+    """Draw why, and what to do now; `movement` draws a reason that leads to its time [s]."""
     draw.heading(texts.WHY)
     starts = dict(enumerate(trace.movements.tolist(), start=trace.first))
     for line in diagnosis.explanation:
         found = MOVEMENT.match(line)
         at = starts.get(int(found[1])) if found else None
         if at is not None:
-            draw.button(line, lambda at=at: go_to(at)).props("flat").classes("reason")
+            movement(line, at)
         elif not line.startswith(STEP):
             draw.text(line)
     draw.heading(texts.NEXT)

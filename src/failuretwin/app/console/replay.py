@@ -64,7 +64,7 @@ class Replay:
                 if diagnosis is not None:
                     draw.heading(texts.VERDICT)
                     draw.text(diagnosis.verdict)
-                    parts.reasons(diagnosis, trace, known.robot, self._go_to)
+                    parts.reasons(diagnosis, trace, known.robot, self._button)
                     parts.motor_table(known.robot, diagnosis)
                 parts.asked(
                     texts.BLIND, texts.ASK_BLIND, lambda: visit.desk.blind_spots(trace, known)
@@ -74,6 +74,10 @@ class Replay:
                 draw.later(self._draw_charts)
         self._marked = -np.inf
         self._move()
+
+    def _button(self, reason: str, at: float) -> None:
+        button = draw.button(reason, lambda: self._go_to(at))
+        button.props("flat").classes("reason")
 
     def _go_to(self, at: float) -> None:
         self._slider.set_value(at)

@@ -16,6 +16,7 @@ from failuretwin.app.console.charts import Charts
 from failuretwin.app.console.layout import Visit, page
 from failuretwin.app.console.live import LiveRobot
 from failuretwin.app.console.state import LiveView
+from failuretwin.core.foreign import printable
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.decision.acting.reach import Reach, reach, workspace
 from failuretwin.decision.robot_state import robot_state
@@ -203,7 +204,7 @@ class LivePage:
             draw.text(view.tile.said)
             self._say_alarm(view)
             if view.diagnosis is not None:
-                parts.reasons(view.diagnosis, self._live.trace(), self._known.robot, self._go_to)
+                parts.reasons(view.diagnosis, self._live.trace(), self._known.robot, self._link)
             draw.heading(texts.MOTORS)
             rows = [
                 [one.name, one.state, percent(float(one.values.get("probability", 0))), one.message]
@@ -223,6 +224,7 @@ class LivePage:
         when = self._visit.time(raised, seconds=True)
         draw.text(texts.ALARM_SINCE.format(time=when, number=episode.number))
 
-    def _go_to(self, at: float) -> None:
-        name = self._live.settings.name
-        ui.navigate.to(draw.link_to("replay", name=name, run=0, at=f"{at:.2f}"))
+    def _link(self, reason: str, at: float) -> None:
+        """Draw a link to a time [s]: unlike a button, it works while all is drawn anew."""
+        address = draw.link_to("replay", name=self._live.settings.name, run=0, at=f"{at:.2f}")
+        ui.link(printable(reason), address).classes("reason")
