@@ -1,20 +1,16 @@
 """How like the real robot the imperfect twin is: figures side by side, and a two-sample test.
 
-    python benchmarks/realism.py HEALTHY_LOG... [--copies 10] [--robot ARM]
-        [--map MAP.toml] [--rests]
+    python benchmarks/realism.py HEALTHY_LOG... [--copies 10]
 
 Each real run has simulated copies with the same targets and ramps. A classifier that cannot tell
 them apart better than by tossing a coin has an area under the curve of 0.5. It is judged on
 sessions that it was not trained on. Then come the features that tell them apart by themselves.
-A robot without a calibration is calibrated on every other run, which is then left out. With
---rests only settled positions count, for logs that have no readings on the way.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +23,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 import failuretwin as ft
-from failuretwin.connection.calibration.calibrate import calibrate, fit_calibration
+from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.connection.calibration.observations import observe, session_names
 from failuretwin.connection.calibration.timing_fit import movements_of
 from failuretwin.core.hypothesis import HEALTHY
@@ -35,7 +31,6 @@ from failuretwin.core.movements import Movements
 from failuretwin.core.runs import concatenate
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.readers.column_map import read_column_map
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
@@ -181,9 +176,7 @@ def table(real: xr.Dataset, simulated: xr.Dataset, robot: Robot) -> None:
             print(f"{name:44s} {p.value:9.4f} {p.low:9.4f} to {p.high:7.4f} {match.value:10.4f}")
 
 
-def two_sample(
-    real: xr.Dataset, simulated: xr.Dataset, robot: Robot, copies: int, rests: bool
-) -> None:
+def two_sample(real: xr.Dataset, simulated: xr.Dataset, robot: Robot, copies: int) -> None:
     """Print how well classifiers tell real from simulated runs, by session, and by which features.
 
     Copies are in the fold of the run that they copy.
@@ -195,8 +188,6 @@ def two_sample(
     y = np.repeat([1, 0], [len(own), copies * len(own)])
     a, b = features(real, robot), features(simulated, robot)
     seen = {name: np.concatenate([a[name], b[name]]) for name in a}
-    if rests:
-        seen = {name: values for name, values in seen.items() if name.startswith("at rest")}
     values = np.stack(list(seen.values()), axis=1)
     kept = np.isfinite(values).any(axis=0)
     values, columns = values[:, kept], np.array(list(seen))[kept]
@@ -243,24 +234,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("logs", nargs="+", help="healthy logs of the robot")
     parser.add_argument("--copies", type=int, default=10)
-    parser.add_argument("--robot", default="armpi_fpv")
-    parser.add_argument("--rests", action="store_true", help="settled positions alone")
-    parser.add_argument("--map", type=Path, help="column map of the logs")
     options = parser.parse_args()
-    robot = ft.load_robot(options.robot)
-    how = ft.ReadOptions()
-    if options.map is not None:
-        how = replace(how, columns=read_column_map(options.map, robot))
-    real = ft.read_runs(options.logs, robot, how)
+    robot = ft.load_robot("armpi_fpv")
+    real = ft.read_runs(options.logs, robot)
     known = load_calibration(None, robot).imperfections
-    if known.of_class:
-        known = calibrate(real.isel(run=slice(0, None, 2)), robot, "half", "logs").imperfections
-        real = real.isel(run=slice(1, None, 2))
     simulated = copies_of(real, robot, known, options.copies)
-    two_sample(real, simulated, robot, options.copies, options.rests)
-    if "position" in real:
-        print()
-        table(real, simulated, robot)
+    two_sample(real, simulated, robot, options.copies)
+    print()
+    table(real, simulated, robot)
 
 
 if __name__ == "__main__":
