@@ -211,12 +211,12 @@ class _Motor:
         direction = np.broadcast_to(moments.direction[:, None], base.shape)
         held = (np.arange(base.shape[-1]) == motor) & self.held
         pose = scene.model.settle(base, direction, held)
-        speed, bend, late = (
+        speed, bend, late, bent = (
             np.broadcast_to(np.where(held, 0.0, values[:, None]), pose.shape)
-            for values in (moments.speed, moments.bend, moments.late)
+            for values in (moments.speed, moments.bend, moments.late, moments.bent)
         )
-        spread, beside = np.swapaxes(pose, 1, 2), np.swapaxes(late, 1, 2)
-        outcomes = Outcomes.of_poses(scene.model, moments, spread, self.variance, beside)
+        spread, *beside = (np.swapaxes(values, 1, 2) for values in (pose, late, bent))
+        outcomes = Outcomes.of_poses(scene.model, moments, spread, self.variance, *beside)
         G = columns(scene.model, pose, Motion(direction, speed, bend), scene.layout)
         jacobian = scene.model.sensors.expected(pose[:, :, :, 0])[1]
         if self.held:

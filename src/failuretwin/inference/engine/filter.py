@@ -33,6 +33,7 @@ class Tables(NamedTuple):
         residual: r_a less what theta moves it by beside f, (normal, place, moment, outcome,
             channel) [m].
         scatter: J diag(s^2) J^T, (place, moment, outcome, channel, channel) [m2].
+        late: J diag(u) J^T, same axes [m2]; without channels where all moments are at rest.
         extra: Variance of single motors, and of theta where outcomes differ from f, (normal, place,
             moment, outcome, channel, channel) [m2].
         log_weight: Log probability of each outcome, (weight place, moment, outcome).
@@ -42,6 +43,7 @@ class Tables(NamedTuple):
 
     residual: FloatArray
     scatter: FloatArray
+    late: FloatArray
     extra: FloatArray
     log_weight: FloatArray
     mean: FloatArray
@@ -55,7 +57,8 @@ class Places(NamedTuple):
         normal: Of each pick.
         place: Of each pick.
         weight_place: Of each pick.
-        variance: Factor on the variance of scatter, and variance of the noise [m2], (pick, 2).
+        variance: Factors on the variance of scatter and of uneven starts, and variance of the
+            noise [m2], (pick, 3).
         usable: Moments with readings, (pick, moment).
         kept: Probability that the outcome of the moment before holds on, (pick, moment).
         lever: H, (pick, moment, channel).
@@ -192,12 +195,15 @@ def _prior(tables: Tables, picks: Places, i: int) -> tuple[FloatArray, FloatArra
 @compiled
 def _write_scales(tables: Tables, picks: Places, i: int, m: int, scale: FloatArray) -> None:
     """Write S_a of one moment, (outcome, channel, channel) [m2]."""
-    n, place, (factor, noise) = picks.normal[i], picks.place[i], picks.variance[i]
+    n, place, (factor, uneven, noise) = picks.normal[i], picks.place[i], picks.variance[i]
     outcomes, channels, _ = scale.shape
+    moves = tables.late.shape[-1] > 0
     for a in range(outcomes):
         for c in range(channels):
             for d in range(channels):
                 scatter = factor * tables.scatter[place, m, a, c, d]
+                if moves:
+                    scatter += uneven * tables.late[place, m, a, c, d]
                 scale[a, c, d] = scatter + tables.extra[n, place, m, a, c, d]
             scale[a, c, c] += noise
 

@@ -49,7 +49,7 @@ class Moments:
         outcome: Index of each among all outcomes of the movement, (run, moment, outcome).
         speed: Of each motor, (run, moment, outcome, motor) [rad/s]; 0 at rest.
         bend: What an acceleration may put it off by, same axes [rad]; 0 at rest.
-        late: Variance of each motor along its motion, same axes [rad2]; 0 at rest.
+        late: Variance of each motor by uneven starts, (qd sigma)^2, same axes [rad2]; 0 at rest.
         done: Share of the movement that each motor had made, (run, moment, motor).
         kept: Probability that what became of the moment before holds on, (run, moment): 1 in one
             ramp, 0 with a new movement.
@@ -72,6 +72,11 @@ class Moments:
     late: FloatArray
     done: FloatArray
     kept: FloatArray
+
+    @property
+    def bent(self) -> FloatArray:
+        """Variance of each motor by what it shares of no bend, as `late` [rad2]."""
+        return np.asarray((OWN_BEND * self.bend) ** 2)
 
     @property
     def runs(self) -> int:
@@ -120,7 +125,7 @@ def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
         outcome=chosen,
         speed=speed,
         bend=bend,
-        late=(speed * model.start_jitter_s) ** 2 + (OWN_BEND * bend) ** 2,
+        late=(speed * model.start_jitter_s) ** 2,
         done=movements.done,
         kept=_kept(movements, way),
     )

@@ -1,9 +1,10 @@
 """Outcomes: what may have become of each moment, with residual and scale.
 
-    r_a = e - y(q_a),    S_a = sigma^2 J diag(s^2) J^T + J diag(v) J^T + sn^2 I
+    r_a = e - y(q_a)
+    S_a = sigma^2 J diag(s^2) J^T + tau^2 J diag(u) J^T + J diag(v) J^T + sn^2 I
 
-with poses q_a, scatter s and its factor sigma, variances v of single motors beside it, and the
-noise sn of the sensor.
+with poses q_a, scatter s and its factor sigma, variances u by uneven starts on the way and their
+factor tau^2, other variances v of single motors, and the noise sn of the sensor.
 
 Section: docs/inference.md#outcomes
 """
@@ -26,11 +27,13 @@ class Outcomes:
     Attributes:
         residual: Seen minus expected, (..., outcome, channel) [m].
         scatter: J diag(s^2) J^T, (..., outcome, channel, channel) [m2].
+        late: J diag(u) J^T, same axes [m2]; without channels where all moments are at rest.
         beside: J diag(v) J^T, same axes [m2].
     """
 
     residual: FloatArray
     scatter: FloatArray
+    late: FloatArray
     beside: FloatArray
 
     @classmethod
@@ -40,6 +43,7 @@ class Outcomes:
         moments: Moments,
         pose: FloatArray,
         variance: FloatArray,
+        late: FloatArray,
         beside: FloatArray,
     ) -> Outcomes:
         """Return the outcomes of some poses.
@@ -49,7 +53,8 @@ class Outcomes:
             moments: The moments.
             pose: Settled angles, (run, moment, ..., motor) [rad].
             variance: Of the scatter of each motor, (..., motor) [rad2].
-            beside: Variance of single motors beside it, same axes as `pose` [rad2].
+            late: By uneven starts, same axes as `pose` [rad2].
+            beside: Variance of single motors beside these, same axes [rad2].
         """
         expected, jacobian = model.sensors.expected(pose)
         point = moments.point
@@ -57,15 +62,17 @@ class Outcomes:
         point = point.reshape(*point.shape[:2], *(1,) * between, point.shape[-1])
         transposed = np.swapaxes(jacobian, -1, -2)
         scatter = np.matmul(jacobian * np.asarray(variance)[..., None, :], transposed)
-        extra = np.broadcast_to(0.0, scatter.shape)
+        extra, uneven = np.broadcast_to(0.0, scatter.shape), scatter[..., :0, :0]
         if beside.any():
             extra = np.matmul(jacobian * beside[..., None, :], transposed)
-        return cls(point - expected, scatter, extra)
+        if moments.late.any():
+            uneven = np.matmul(jacobian * late[..., None, :], transposed)
+        return cls(point - expected, scatter, uneven, extra)
 
     @property
-    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """All that is known of them, in the order of attributes."""
-        return self.residual, self.scatter, self.beside
+        return self.residual, self.scatter, self.late, self.beside
 
     def with_rows(self) -> Outcomes:
         """Return the same with an axis for rows behind that of runs."""

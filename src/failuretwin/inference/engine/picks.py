@@ -132,6 +132,7 @@ def _tables(
     tables = (
         np.stack(residuals),
         outcomes.scatter,
+        outcomes.late,
         np.stack(extras),
         log_weight,
         np.stack(means),
@@ -223,12 +224,13 @@ class Part:
     @property
     def _places(self) -> Places:
         picks, component = self.picks, self.picks.component
-        factor, noise = self.components.sigma[component], self.components.noise_m[component]
+        known = self.components
+        factors = known.sigma[component], known.jitter[component], known.noise_m[component]
         return Places(
             self._prepared_normal,
             self.place,
             self.prepared.weight_place[picks.run, picks.row],
-            np.stack([factor, noise], axis=1) ** 2,
+            np.stack(factors, axis=1) ** 2,
             self.scene.moments.usable[picks.run],
             _kept(self.scene, self.rows, picks),
             self.rows.lever[picks.run, picks.row],
@@ -259,8 +261,10 @@ class Part:
     def outcomes_at(self, m: int) -> tuple[FloatArray, FloatArray]:
         """Return r_a (pick, outcome, channel) [m] and S_a (..., channel, channel) [m2]."""
         places, tables = self._places, self.prepared.tables
-        (factor, noise), at = places.variance.T[..., None, None, None], places.place
+        (factor, uneven, noise), at = places.variance.T[..., None, None, None], places.place
         scale = factor * tables.scatter[at, m] + tables.extra[places.normal, at, m]
+        if tables.late.size:
+            scale = scale + uneven * tables.late[at, m]
         return tables.residual[places.normal, at, m], scale + noise * np.eye(scale.shape[-1])
 
 

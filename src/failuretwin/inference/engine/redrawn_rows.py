@@ -9,6 +9,8 @@ Section: docs/inference.md#hypotheses
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from failuretwin.core.numerics import log_of
@@ -85,10 +87,12 @@ def _nodes(scene: Scene, motor: int, size: FloatArray, width: FloatArray) -> Out
     base = np.repeat(moments.base[:, :, :1], len(size), axis=2)
     base[..., motor] += size * moments.done[:, :, None, motor]
     direction = np.broadcast_to(moments.direction[:, :, :1], base.shape)
-    beside = np.repeat(moments.late[:, :, :1], len(size), axis=2)
+    late, beside = (
+        np.repeat(values[:, :, :1], len(size), axis=2) for values in (moments.late, moments.bent)
+    )
     beside[..., motor] += width**2 / 12.0
     pose = model.settle(base, direction, model.none_held)
-    return Outcomes.of_poses(model, moments, pose, model.scatter**2, beside)
+    return Outcomes.of_poses(model, moments, pose, model.scatter**2, late, beside)
 
 
 def _beside_losses(scene: Scene, motor: int, mean_square: float, fourth: float) -> Outcomes:
@@ -99,16 +103,16 @@ def _beside_losses(scene: Scene, motor: int, mean_square: float, fourth: float) 
     A motor moves the tool on a circle: J alone is millimetres off for errors of some degrees.
     """
     moments, model = scene.moments, scene.model
-    beside = moments.late[:, :, 1:].copy()
+    late, beside = moments.late[:, :, 1:], moments.bent[:, :, 1:]
     beside[..., motor] += mean_square
     pose = scene.pose[:, :, 1:]
-    found = Outcomes.of_poses(model, moments, pose, model.scatter**2, beside)
+    found = Outcomes.of_poses(model, moments, pose, model.scatter**2, late, beside)
     off = np.zeros_like(pose)
     off[..., motor] = np.sqrt(mean_square) * moments.done[:, :, None, motor]
     middle, *ends = (model.sensors.expected(pose + step)[0] for step in (0.0, off, -off))
     bend = 0.5 * (ends[0] + ends[1]) - middle
     spread = (fourth / mean_square**2 - 1.0) * bend[..., :, None] * bend[..., None, :]
-    return Outcomes(found.residual - bend, found.scatter, found.beside + spread)
+    return replace(found, residual=found.residual - bend, beside=found.beside + spread)
 
 
 def _weights(scene: Scene, masses: list[FloatArray]) -> FloatArray:

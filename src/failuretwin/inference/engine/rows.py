@@ -110,7 +110,8 @@ class Scene:
         G = columns(model, pose, motion, layout)
         usual = G[:, :, 0]
         spread = usual @ covariance @ np.swapaxes(usual, -1, -2)
-        healthy = Outcomes.of_poses(model, moments, pose, model.scatter**2, moments.late)
+        beside = moments.late, moments.bent
+        healthy = Outcomes.of_poses(model, moments, pose, model.scatter**2, *beside)
         return cls(model, moments, priors, noise, layout, G, spread, pose, healthy)
 
     @property

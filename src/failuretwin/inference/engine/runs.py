@@ -156,7 +156,8 @@ class RunsEvidence:
         One of each normal distribution of theta, (run, component).
         """
         components = self.components
-        rank = np.argsort(np.lexsort((components.noise_m, components.sigma)))
+        scales = components.jitter, components.noise_m, components.sigma
+        rank = np.argsort(np.lexsort(scales))
         height = np.where(wanted, rank, -1)
         of = components.normal[:, None] == components.normal
         return np.asarray(wanted & (height >= np.where(of, height[:, None], -1).max(axis=2)))

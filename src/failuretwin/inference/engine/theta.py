@@ -93,7 +93,7 @@ class Layout:
 class Components:
     """Beliefs about the robot: theta normal in each, with its scatter and its sensor.
 
-    Components that differ in scatter or noise alone share a normal distribution of theta.
+    Components that differ in scatter, jitter or noise alone share a normal distribution of theta.
 
     Attributes:
         log_weight: Log of the probability of each, (component,) or (run, component).
@@ -101,6 +101,7 @@ class Components:
         mean: mu, (normal, theta) or of each run, (run, normal, theta).
         covariance: V, (normal, theta, theta) or (run, normal, theta, theta).
         sigma: Factor on the scatter of the motors, (component,).
+        jitter: Factor on the deviation of when motors start, (component,).
         noise_m: Noise of the sensor, (component,) [m].
         displaced: Whether the sensor stands elsewhere than the profile says, (component,).
     """
@@ -110,6 +111,7 @@ class Components:
     mean: FloatArray
     covariance: FloatArray
     sigma: FloatArray
+    jitter: FloatArray
     noise_m: FloatArray
     displaced: BoolArray
 
@@ -130,6 +132,7 @@ class Components:
             np.zeros(1, dtype=np.int64),
             np.zeros((1, len(covariance))),
             covariance[None],
+            np.ones(1),
             np.ones(1),
             np.array([noise_m]),
             np.array([displaced]),
@@ -201,6 +204,7 @@ class Components:
             np.concatenate([one.mean for one in parts], axis=-2),
             np.concatenate([one.covariance for one in parts], axis=-3),
             np.concatenate([one.sigma for one in parts]),
+            np.concatenate([one.jitter for one in parts]),
             np.concatenate([one.noise_m for one in parts]),
             np.concatenate([one.displaced for one in parts]),
         )
@@ -276,26 +280,32 @@ def layout_of(model: HealthyModel, moving: bool = False) -> Layout:
 
 @dataclass(frozen=True)
 class ScaleFactors:
-    """Factors on scatter and noise, and the share of robots of each.
+    """Factors on scatter, noise and jitter, and the share of robots of each.
 
     Attributes:
         scatter: On the scatter of the motors.
         noise: On the noise of the sensor.
+        jitter: On the deviation of when motors start, of robots that are seen on the way.
     """
 
     scatter: Mapping[float, float]
     noise: Mapping[float, float]
+    jitter: Mapping[float, float]
 
 
-AS_TOLD = ScaleFactors({1.0: 1.0}, {1.0: 1.0})
+JITTER = {1.0: 0.4, 0.3: 0.3, 0.1: 0.3}
+"""Of all robots: controllers of industrial arms are far more punctual than servos on a bus;
+assumed."""
+AS_TOLD = ScaleFactors({1.0: 1.0}, {1.0: 1.0}, {1.0: 1.0})
 """Scatter and noise are known."""
 OF_CLASS = ScaleFactors(
     {0.5: 0.25, 1.0: 0.4, 2.0: 0.2, 4.0: 0.1, 9.0: 0.05},
     {0.1: 0.2, 0.3: 0.15, 1.0: 0.5, 3.0: 0.1, 8.0: 0.05},
+    JITTER,
 )
 """Of robots that nobody has calibrated; assumed, heavy above 1."""
 SINCE_CALIBRATED = ScaleFactors(
-    {1.0: 0.72, 1.6: 0.14, 2.5: 0.1, 4.0: 0.04}, {1.0: 0.92, 3.0: 0.05, 8.0: 0.03}
+    {1.0: 0.72, 1.6: 0.14, 2.5: 0.1, 4.0: 0.04}, {1.0: 0.92, 3.0: 0.05, 8.0: 0.03}, JITTER
 )
 """Of calibrated robots, which wear, work at other speeds or stand elsewhere since; assumed."""
 
@@ -308,20 +318,22 @@ def robot_components(model: HealthyModel, layout: Layout, factors: ScaleFactors)
     Args:
         model: The healthy robot.
         layout: Places in theta.
-        factors: What is unknown of its scatter and of the noise of its sensor.
+        factors: What is unknown of its scatter, of the noise of its sensor and of its starts.
     """
     doubted = bool(np.any(offset_deviation(model)))
     factors_of = (1.0, ODD_FACTOR) if doubted else (1.0,)
     rate = ODD_RATE if doubted else 0.0
+    starts = (factors.jitter if layout.moving else AS_TOLD.jitter).items()
+    sensors = [((tau, kappa), a * b) for tau, a in starts for kappa, b in factors.noise.items()]
     found = [
-        (a * b * (1.0 - rate), 0, sigma, kappa)
+        (a * b * (1.0 - rate), 0, sigma, *others)
         for sigma, a in factors.scatter.items()
-        for kappa, b in factors.noise.items()
+        for others, b in sensors
     ]
     if doubted:
-        found += [(b * rate, 1, 1.0, kappa) for kappa, b in factors.noise.items()]
+        found += [(b * rate, 1, 1.0, *others) for others, b in sensors]
     found.sort(key=lambda one: -one[0])
-    weight, normal, sigma, kappa = zip(*found, strict=True)
+    weight, normal, sigma, tau, kappa = zip(*found, strict=True)
     covariance = np.stack([_covariance(model, layout, factor) for factor in factors_of])
     return Components(
         np.log(weight),
@@ -329,6 +341,7 @@ def robot_components(model: HealthyModel, layout: Layout, factors: ScaleFactors)
         np.zeros((len(covariance), layout.size)),
         covariance,
         np.array(sigma),
+        np.array(tau),
         model.path_noise * np.array(kappa),
         np.zeros(len(sigma), dtype=bool),
     )

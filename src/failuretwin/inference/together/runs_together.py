@@ -271,6 +271,7 @@ class RunsTogether:
             mean,
             covariance,
             np.ones(count),
+            np.ones(count),
             np.full(count, noise_m),
             np.zeros(count, dtype=bool),
         )
