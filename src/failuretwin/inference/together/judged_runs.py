@@ -39,7 +39,7 @@ class Judged:
         rows: Which they are.
         weighing: The runs, about one theta.
         cavity: What was believed without them, in units.
-        loose: Whether the frame of the sensor is in doubt in each component, (component,).
+        loose: Whether the frame of the sensor is in doubt in each part of the cavity, (part,).
     """
 
     rows: IntArray
@@ -68,7 +68,7 @@ class Judged:
         Returns:
             Probability of that (run,), mean (run, theta) and covariance (run, theta, theta).
         """
-        which = self.loose == loose
+        which = self.loose[self.weighing.components.normal] == loose
         some = [part.of_components(which) for part in self.parts]
         weight = np.zeros(self.runs)
         for part in some:

@@ -23,7 +23,14 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.engine.theta import Components, Layout, offsets_doubted, offsets_of
+from failuretwin.inference.engine.theta import (
+    AS_TOLD,
+    JITTER,
+    Components,
+    Layout,
+    offsets_doubted,
+    offsets_of,
+)
 from failuretwin.inference.engine.weighing import Weighing
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -260,20 +267,25 @@ class RunsTogether:
         return Judged(rows, weighing, used, self._loose[some])
 
     def _components(self, belief: Belief, noise_m: float) -> Components:
-        """Return beliefs of each run about where runs are expanded, no longer in units."""
+        """Return beliefs of each run about where runs are expanded, no longer in units.
+
+        How evenly motors start is unknown of each run that is seen on the way.
+        """
         covariance: FloatArray = np.asarray(np.linalg.inv(belief.precision))
         mean = np.einsum("rctu,rcu->rct", covariance, belief.shift) * self.unit - self.here
         covariance = np.asarray(covariance * np.outer(self.unit, self.unit))
-        count = mean.shape[1]
+        starts = JITTER if self.layout.moving else AS_TOLD.jitter
+        normal = np.tile(np.arange(mean.shape[1]), len(starts))
+        share = np.repeat(list(starts.values()), mean.shape[1])
         return Components(
-            belief.log_weight,
-            np.arange(count),
+            belief.log_weight[:, normal] + np.log(share),
+            normal,
             mean,
             covariance,
-            np.ones(count),
-            np.ones(count),
-            np.full(count, noise_m),
-            np.zeros(count, dtype=bool),
+            np.ones(len(normal)),
+            np.repeat(list(starts), mean.shape[1]),
+            np.full(len(normal), noise_m),
+            np.zeros(len(normal), dtype=bool),
         )
 
     @property
