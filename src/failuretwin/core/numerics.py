@@ -43,6 +43,8 @@ def log_of(values: ArrayLike) -> FloatArray:
         return np.log(as_floats(values))
 
 
+SAME_LEVEL = 1e-9
+"""Probabilities that differ by less are equal."""
 SAME_VALUE = 1e-9
 """Values that differ by a smaller share of their range are equal [-]."""
 
@@ -53,7 +55,8 @@ def weighted_quantiles(
     """Return quantiles of each row of weighted `values`, (..., value) -> (..., level).
 
     Linear between the middles of the weights. Values that differ only by rounding form one atom
-    with a step, so that their order does not matter.
+    with a step, so that their order does not matter. A level at the end of a step gives the middle
+    between that atom and the next.
     """
     order = np.argsort(values, axis=-1)
     values = np.take_along_axis(values, order, axis=-1)
@@ -73,7 +76,8 @@ def _quantiles(values: FloatArray, weights: FloatArray, levels: tuple[float, ...
     end = np.cumsum(weights)
     steps = np.stack([end - weights + inset, end - inset], axis=1).ravel()
     total = max(float(end[-1]), np.finfo(float).tiny)
-    return np.asarray(np.interp(levels, steps / total, np.repeat(values[first], 2)))
+    asked = np.array(levels)[:, None] + SAME_LEVEL * np.array([-1.0, 1.0])
+    return np.interp(asked, steps / total, np.repeat(values[first], 2)).mean(axis=1)
 
 
 # Covariances of what sensors see, many at once: S = A A^T + noise I.

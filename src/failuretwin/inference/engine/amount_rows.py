@@ -45,6 +45,8 @@ TIED = 2.0
 """Deviation of a held angle from where the motor had settled, in its scatter."""
 MARGIN = 4.0
 """What a motor that stops on its ramp may be beyond its ends, in its scatter."""
+SAME_NATS = 1e-6
+"""Densities that differ by less say the same."""
 BEYOND = 0.1
 """Share of its travel by which a motor may be held beyond its ends."""
 LONG_S = 10.0
@@ -116,7 +118,7 @@ class _Motor:
             outcome,
         )
         whole = np.where(self._counts[..., None], says, 0.0).sum(axis=2)
-        at = whole.argmax(axis=-1)[..., None]
+        at = _middle_of_best(whole)[..., None]
         outcome = np.broadcast_to(outcome, (*self._counts.shape, outcome.shape[-1]))
         found = np.take_along_axis(np.broadcast_to(grid[:, None], whole.shape), at, axis=2)
         return found[..., 0], np.take_along_axis(outcome, at[..., None], axis=3)[..., 0]
@@ -236,6 +238,15 @@ class _Motor:
             onsets=sampled(*onsets),
         )
         return before_onset(rows, scene.healthy, scene.columns)
+
+
+def _middle_of_best(says: FloatArray) -> IntArray:
+    """Return the best node of each row, the middle one where several say the same, (..., node).
+
+    A motor without a load tells nothing of a lost stiffness: rounding must not choose.
+    """
+    before = np.cumsum(says >= says.max(axis=-1, keepdims=True) - SAME_NATS, axis=-1)
+    return np.asarray((2 * before > before[..., -1:]).argmax(axis=-1))
 
 
 @compiled
