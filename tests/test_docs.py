@@ -234,12 +234,9 @@ def test_every_public_name_has_an_example(name):
 
 
 def test_the_reference_has_every_public_name_once():
-    pages = sorted((ROOT / "docs" / "reference").glob("api_*.md"))
-    text = "\n".join(page.read_text("utf-8") for page in pages)
+    text = (ROOT / "docs" / "reference" / "api.md").read_text("utf-8")
     documented = re.findall(r"auto(?:class|function|exception):: failuretwin\.(\w+)", text)
     assert sorted(documented) == sorted(set(failuretwin.__all__) - {"__version__"})
-    overview = (ROOT / "docs" / "reference" / "api.md").read_text("utf-8")
-    assert sorted(re.findall(r"^   ([A-Za-z_]\w*)$", overview, re.MULTILINE)) == sorted(documented)
 
 
 def sentences(text: str) -> list[str]:
