@@ -104,6 +104,6 @@ def test_the_site_builds_without_warnings(tmp_path):
     words = ["-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "docs", str(tmp_path)]
     done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
-    diagnosis = (tmp_path / "reference" / "api_diagnose.html").read_text("utf-8")
+    diagnosis = (tmp_path / "reference" / "api.html").read_text("utf-8")
     assert "cannot be read, or does not fit together" in diagnosis
     assert "--self-calibrate" in (tmp_path / "reference" / "cli.html").read_text("utf-8")

@@ -1,4 +1,4 @@
-"""Fault modes of a user: the one that the page on fault modes offers for copying."""
+"""Fault modes of a user: the one that the tutorial on fault modes offers for copying."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from pathlib import Path
 
 from failuretwin.failure_behavior.registry import MODES, load_plugin
 
-PAGE = Path(__file__).parents[1] / "docs" / "fault_modes.md"
+PAGE = Path(__file__).parents[1] / "docs" / "tutorials" / "own_fault_mode.md"
 
 
 def code_on_the_page():
-    text = PAGE.read_text("utf-8").partition("## A mode of your own")[2]
-    return re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]
+    return re.search(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)[1]
 
 
 @contextmanager
