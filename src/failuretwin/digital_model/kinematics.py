@@ -20,52 +20,50 @@ GRAVITY = 9.81
 """Acceleration of free fall, along -z of the base [m/s2]."""
 
 
-@compiled
-def _advance(R: FloatArray, p: FloatArray, T: FloatArray) -> None:
-    """Move on from a frame, with axes R and origin p in the base, by a constant transform."""
-    for i in range(3):
-        x, y, z = R[i, 0], R[i, 1], R[i, 2]
-        p[i] += x * T[0, 3] + y * T[1, 3] + z * T[2, 3]
-        for j in range(3):
-            R[i, j] = x * T[0, j] + y * T[1, j] + z * T[2, j]
+Frame = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+"""Unit vectors along x, y and z of a frame, then its origin [m]: single numbers, which the compiler
+keeps in registers."""
 
 
 @compiled
-def _move(R: FloatArray, p: FloatArray, value: float, slides: bool) -> None:
-    """Turn a frame about its z axis, or slide it along."""
+def _base() -> Frame:
+    return 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
+
+
+@compiled
+def _advanced(frame: Frame, T: FloatArray) -> Frame:
+    """Return the frame behind a constant transform."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz = frame
+    a, b, c = T[0, 0], T[1, 0], T[2, 0]
+    d, e, f = T[0, 1], T[1, 1], T[2, 1]
+    g, h, i = T[0, 2], T[1, 2], T[2, 2]
+    u, v, w = T[0, 3], T[1, 3], T[2, 3]
+    return (
+        a * xx + b * yx + c * zx,
+        a * xy + b * yy + c * zy,
+        a * xz + b * yz + c * zz,
+        d * xx + e * yx + f * zx,
+        d * xy + e * yy + f * zy,
+        d * xz + e * yz + f * zz,
+        g * xx + h * yx + i * zx,
+        g * xy + h * yy + i * zy,
+        g * xz + h * yz + i * zz,
+        px + u * xx + v * yx + w * zx,
+        py + u * xy + v * yy + w * zy,
+        pz + u * xz + v * yz + w * zz,
+    )
+
+
+@compiled
+def _moved(frame: Frame, value: float, slides: bool) -> Frame:
+    """Return the frame behind a joint: turned about its z axis, or slid along it."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz = frame
+    if slides:
+        origin = px + value * zx, py + value * zy, pz + value * zz
+        return xx, xy, xz, yx, yy, yz, zx, zy, zz, *origin
     c, s = np.cos(value), np.sin(value)
-    for i in range(3):
-        if slides:
-            p[i] += value * R[i, 2]
-        else:
-            x, y = R[i, 0], R[i, 1]
-            R[i, 0], R[i, 1] = c * x + s * y, c * y - s * x
-
-
-@compiled
-def _start(R: FloatArray, p: FloatArray) -> None:
-    """Go to the base."""
-    for i in range(3):
-        p[i] = 0.0
-        for j in range(3):
-            R[i, j] = 1.0 if i == j else 0.0
-
-
-@compiled
-def _pass(
-    R: FloatArray,
-    p: FloatArray,
-    T: FloatArray,
-    value: float,
-    slides: bool,
-    axis: FloatArray,
-    origin: FloatArray,
-) -> None:
-    """Pass a joint behind a constant transform; write its axis and where it lies."""
-    _advance(R, p, T)
-    for i in range(3):
-        axis[i], origin[i] = R[i, 2], p[i]
-    _move(R, p, value, slides)
+    x = c * xx + s * yx, c * xy + s * yy, c * xz + s * yz
+    return *x, c * yx - s * xx, c * yy - s * xy, c * yz - s * xz, zx, zy, zz, px, py, pz
 
 
 @compiled
@@ -73,17 +71,15 @@ def _write_frames(
     q: FloatArray, transforms: FloatArray, slides: BoolArray, found: FloatArray
 ) -> None:
     """Write x, y, z axis and origin of joints and tool, (joint + 1, 4, coordinate, pose)."""
-    R, p, joints = np.empty((3, 3)), np.empty(3), q.shape[1]
+    joints = q.shape[1]
     for n in range(len(q)):
-        _start(R, p)
+        frame = _base()
         for j in range(joints + 1):
-            _advance(R, p, transforms[j])
-            for i in range(3):
-                found[j, 3, i, n] = p[i]
-                for k in range(3):
-                    found[j, k, i, n] = R[i, k]
+            frame = _advanced(frame, transforms[j])
+            for k in range(12):
+                found[j, k // 3, k % 3, n] = frame[k]
             if j < joints:
-                _move(R, p, q[n, j], slides[j])
+                frame = _moved(frame, q[n, j], slides[j])
 
 
 @compiled
@@ -95,20 +91,22 @@ def _write_positions(
     jacobian: FloatArray,
 ) -> None:
     """Write tool positions (pose, 3) and, where there is room, Jacobians (pose, 3, joint)."""
-    R, p, joints = np.empty((3, 3)), np.empty(3), q.shape[1]
+    joints = q.shape[1]
     axis, origin = np.empty((joints, 3)), np.empty((joints, 3))
     for n in range(len(q)):
-        _start(R, p)
+        frame = _base()
         for j in range(joints):
-            _pass(R, p, transforms[j], q[n, j], slides[j], axis[j], origin[j])
-        _advance(R, p, transforms[joints])
-        for i in range(3):
-            point[n, i] = p[i]
+            frame = _advanced(frame, transforms[j])
+            axis[j, 0], axis[j, 1], axis[j, 2] = frame[6:9]
+            origin[j, 0], origin[j, 1], origin[j, 2] = frame[9:12]
+            frame = _moved(frame, q[n, j], slides[j])
+        p = _advanced(frame, transforms[joints])[9:12]
+        point[n, 0], point[n, 1], point[n, 2] = p
         if len(jacobian):
             for j in range(joints):
                 for i in range(3):
                     k, m = (i + 1) % 3, (i + 2) % 3
-                    far, near = p[m] - origin[j, m], p[k] - origin[j, k]
+                    far, near = point[n, m] - origin[j, m], point[n, k] - origin[j, k]
                     turned = axis[j, k] * far - axis[j, m] * near
                     jacobian[n, i, j] = axis[j, i] if slides[j] else turned
 
@@ -134,19 +132,22 @@ def _write_torques(
         payload: Mass at the tool point, (pose,) [kg].
         torque: Written.
     """
-    R, p, joints = np.empty((3, 3)), np.empty(3), q.shape[1]
+    joints = q.shape[1]
     axis, origin, middle = np.empty((3, joints, 3))
     for n in range(len(q)):
-        _start(R, p)
+        frame = _base()
         for j in range(joints):
-            _pass(R, p, transforms[j], q[n, j], slides[j], axis[j], origin[j])
-            for i in range(3):
-                middle[j, i] = p[i]
-                for k in range(3):
-                    middle[j, i] += R[i, k] * centre[j, k]
-        _advance(R, p, transforms[joints])
+            frame = _advanced(frame, transforms[j])
+            axis[j, 0], axis[j, 1], axis[j, 2] = frame[6:9]
+            origin[j, 0], origin[j, 1] = frame[9:11]
+            frame = _moved(frame, q[n, j], slides[j])
+            xx, xy, _, yx, yy, _, zx, zy, _, px, py, _ = frame
+            c, d, e = centre[j]
+            middle[j, 0] = px + xx * c + yx * d + zx * e
+            middle[j, 1] = py + xy * c + yy * d + zy * e
+        tool = _advanced(frame, transforms[joints])
         carried = payload[n]
-        x, y = carried * p[0], carried * p[1]
+        x, y = carried * tool[9], carried * tool[10]
         for j in range(joints - 1, -1, -1):
             carried += mass[j]
             x += mass[j] * middle[j, 0]
