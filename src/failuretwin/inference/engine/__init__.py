@@ -9,7 +9,9 @@ Read in this order; each module states its term:
     moments        settled positions and readings on the way -> moments
     theta          shared parameters: registration, offsets, joint frames, lags; scatter and noise
     outcomes       outcomes of a moment: residual and scale
-    rows           discrete parts of a hypothesis; amount_rows, redrawn_rows: by signature
+    rows           discrete parts of a hypothesis
+    moved_motor    a motor that a fault moves by one amount
+    held_rows, offset_rows, redrawn_rows    rows by signature
     picks, runs    rows by components of the robot: the evidence of every hypothesis
     posterior      posterior of onset, size and theta
     weighing       all hypotheses by runs whose theta is a mixture of normal distributions

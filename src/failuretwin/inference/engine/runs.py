@@ -22,8 +22,9 @@ from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.engine.amount_rows import held_rows, offset_rows
 from failuretwin.inference.engine.filter import RowsPosterior
+from failuretwin.inference.engine.held_rows import held_rows
+from failuretwin.inference.engine.offset_rows import offset_rows
 from failuretwin.inference.engine.picks import Part, Picks, Prepared, narrowed, prepared
 from failuretwin.inference.engine.redrawn_rows import redrawn_rows
 from failuretwin.inference.engine.rows import Rows, Scene

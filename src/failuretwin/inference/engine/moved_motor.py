@@ -1,4 +1,4 @@
-"""Faults of one amount for the whole run: a held angle, a constant offset, a rate.
+"""A motor that a fault moves by one amount, and the amount that explains its moments best.
 
     angle of the motor in moment m = phi_m(x),    x = centre + z,    H_m = J_k dphi_m/dx
 
@@ -16,17 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from failuretwin.core.compiled import compiled
-from failuretwin.core.numerics import log_of
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.digital_model.settling import sag
-from failuretwin.failure_behavior.fault import Arrival
-from failuretwin.failure_behavior.mode import FaultMode, Signature
 from failuretwin.inference.engine.integral import Noise, invert, log_density
 from failuretwin.inference.engine.outcomes import Outcomes
 from failuretwin.inference.engine.rows import AmountPrior, Rows, Scene, before_onset, sampled
 from failuretwin.inference.engine.theta import Motion, columns
-from failuretwin.inference.faults.fault_sizes import SizePrior, coarse_sizes
-from failuretwin.inference.faults.priors import OnsetIntervals, plateau_or_ramp
 
 Angle = Callable[[FloatArray, IntArray], FloatArray]
 """Angle of the motor at some amounts under outcomes of the commands,
@@ -35,28 +29,16 @@ ARRIVED = np.zeros((1, 1, 1), dtype=np.int64)
 """The first outcome of each moment: every command arrives."""
 CHEBYSHEV = 9
 """Amounts at which what is expected is computed; between them it is interpolated."""
-GRID = 61
-"""Held angles among which the best is looked for."""
 FREE_RAD = 0.08
 """Deviation of the angle about the best one, before the prior of the amount is put in [rad]."""
 STEPS, LONGEST = 2, 0.1
 """Gauss-Newton steps from the best of the grid, and the longest [rad]."""
-TIED = 2.0
-"""Deviation of a held angle from where the motor had settled, in its scatter."""
-MARGIN = 4.0
-"""What a motor that stops on its ramp may be beyond its ends, in its scatter."""
 SAME_NATS = 1e-6
 """Densities that differ by less say the same."""
-BEYOND = 0.1
-"""Share of its travel by which a motor may be held beyond its ends."""
-LONG_S = 10.0
-"""A fault that does not change has been there for so long [s]."""
-CELLS = 3
-"""Onsets within a stretch of time to sum over, of a fault that grows."""
 
 
 @dataclass(frozen=True)
-class _Motor:
+class MovedMotor:
     """One motor of a scene, and how an amount moves it.
 
     Attributes:
@@ -354,206 +336,3 @@ def _chebyshev(grid: FloatArray) -> tuple[FloatArray, FloatArray]:
     degree = CHEBYSHEV - 1
     between = chebyshev.chebvander(at, degree) @ np.linalg.inv(chebyshev.chebvander(points, degree))
     return low + 0.5 * (points + 1.0) * (high - low), between
-
-
-# A motor that is held.
-
-
-def held_rows(scene: Scene, motor: int) -> Rows:
-    """Return the rows of a stuck motor: each onset, on the plateau and anywhere else."""
-    moments, priors = scene.moments, scene.priors
-    count, scatter = moments.count, max(float(scene.model.scatter[motor]), 1e-4)
-    low, high = held_range(scene, motor)
-    goal = scene.settled[..., motor]
-    off = goal - moments.base[:, :, 0, motor]
-    was = moments.origin[..., motor] + np.concatenate([off[:, :1], off[:, :-1]], axis=1)
-    intervals = stuck_intervals(scene, motor)
-    known, share = priors.onset.known_s, priors.onset.free
-    weight = intervals.weights(priors.onset.before_run("stuck"))
-    if known is not None:
-        weight = intervals.holding(known)
-    first = np.repeat(np.arange(count), 2)
-    moving = _Motor(scene, motor, True, _held_angle(count), first)
-    later = _Motor(scene, motor, True, _held_angle(count), np.arange(count))
-    best = later.best(np.linspace(low, high, GRID, axis=1), alike=True)
-    free = later.refined(best, low[:, None], high[:, None])
-    log_prior = np.stack(
-        [
-            log_of(weight[..., 0]) + np.log1p(-share),
-            log_of(weight[..., 1] + share * weight[..., 0]),
-        ],
-        axis=2,
-    )
-    tied = np.tile([True, False], count)
-    variance = np.where(tied, (TIED * scatter) ** 2, FREE_RAD**2) * np.ones((moments.runs, 1))
-    ends = np.repeat(np.stack([was, goal]), 2, axis=2)
-    start, stop = ends.min(axis=0) - MARGIN * scatter, ends.max(axis=0) + MARGIN * scatter
-    centre = _flat(was, free)
-
-    def amount_prior(x: FloatArray, run: IntArray, row: IntArray) -> FloatArray:
-        begin, end = start[run, row, None], stop[run, row, None]
-        between = np.where((x >= begin) & (x <= end), -np.log(end - begin), -np.inf)
-        anywhere = np.log(share) - np.log(high - low)[run, None]
-        ramp = np.logaddexp(np.log1p(-share) + between, anywhere)
-        width = variance[run, row, None]
-        normal = -0.5 * ((x - centre[run, row, None]) ** 2 / width + np.log(2.0 * np.pi * width))
-        return np.where(tied[row, None], normal, ramp)
-
-    onset = _stuck_onsets(intervals, was, goal, centre)
-    if known is not None:
-        onset = np.full_like(onset[0], known), onset[1]
-    return moving.rows(
-        centre, variance, _flat(log_prior[..., 0], log_prior[..., 1]), amount_prior, onset
-    )
-
-
-def _flat(plateau: FloatArray, ramp: FloatArray) -> FloatArray:
-    """Return values of plateaus and ramps (run, moment) as those of rows, (run, row)."""
-    return np.stack([plateau, ramp], axis=2).reshape(len(plateau), -1)
-
-
-def _held_angle(count: int) -> Angle:
-    def angle(x: FloatArray, outcome: IntArray) -> FloatArray:
-        del outcome
-        return np.repeat(x[:, :, None], count, axis=2)
-
-    return angle
-
-
-def held_range(scene: Scene, motor: int) -> tuple[FloatArray, FloatArray]:
-    """Return the lowest and the highest angle at which a motor may be held, (run,) [rad] each."""
-    robot, moments = scene.model.twin.robot, scene.moments
-    low, high = robot.travel[motor]
-    margin = BEYOND * (high - low)
-    if not robot.slides[motor]:  # beyond a full turn all angles come again
-        margin = min(margin, max(0.0, np.pi - 0.5 * (high - low)))
-    told = np.concatenate([moments.origin[:, :1, motor], moments.target[..., motor]], axis=1)
-    lowest, highest = told.min(axis=1), told.max(axis=1)
-    return np.minimum(low, lowest) - margin, np.maximum(high, highest) + margin
-
-
-def stuck_intervals(scene: Scene, motor: int) -> OnsetIntervals:
-    """Return plateau and ramp before each moment, (run, moment, plateau | ramp) [s]."""
-    moments, model = scene.moments, scene.model
-    start = moments.start + model.lag_s
-    ramp = moments.ramp[..., motor] * (1.0 - model.shortening)
-    return plateau_or_ramp(start, start + ramp)
-
-
-POINTS = np.linspace(0.05, 0.95, 10)
-"""Where in a stretch of time onsets are sampled, as shares of its length."""
-LAG_DOUBT_S = 0.03
-"""Deviation of one motor's lag about the mean of the robot [s]: it widens the onset's interval."""
-
-
-def _stuck_onsets(
-    intervals: OnsetIntervals, was: FloatArray, goal: FloatArray, centre: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return samples of the onset of each row: anywhere on a plateau, on a ramp where it stands."""
-    begin, length = np.nan_to_num(intervals.begin), intervals.length
-    onset = begin[..., None] + POINTS * length[..., None]  # (run, moment, part, sample)
-    travel = goal - was
-    safe = np.where(np.abs(travel) > 1e-6, travel, 1.0)
-    free = centre.reshape(*was.shape, 2)[..., 1]
-    passed = np.clip((free - was) / safe, 0.0, 1.0)
-    on_ramp = begin[..., 1] + passed * length[..., 1]
-    spread = LAG_DOUBT_S * np.linspace(-1.7, 1.7, len(POINTS))
-    ramp = np.maximum(on_ramp[..., None] + spread, 0.0)
-    anywhere = np.concatenate([onset[..., 0, :], onset[..., 1, :]], axis=-1)
-    within = ((free - was) / safe > -0.05) & ((free - was) / safe < 1.05)
-    ramp = np.where(within[..., None], ramp, anywhere[..., ::2])
-    found = np.stack([onset[..., 0, :], ramp], axis=2).reshape(len(was), -1, len(POINTS))
-    return found, np.full(found.shape, 1.0 / len(POINTS))
-
-
-# A motor that settles off its target by a constant size, or by one that grows.
-
-
-def offset_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
-    """Return the rows of a fault whose size holds for the run, with each onset."""
-    early = scene.priors.onset.before_run(mode.mode)
-    sizes = scene.priors.sizes_of(mode, scene.model, motor)
-    intervals = moment_intervals(scene)
-    count, growing = scene.moments.count, mode.signature is Signature.GROWING_OFFSET
-    if growing:
-        points = (np.arange(CELLS) + 0.5) / CELLS
-        onset, share = intervals.samples(early, points)  # (run, moment, sample)
-        samples = onset.shape[-1]
-        log_prior = log_of(intervals.weights(early)[..., None] * share).reshape(len(onset), -1)
-        first = np.repeat(np.arange(count), samples)
-        at = onset.reshape(len(onset), -1)
-        since = np.maximum(scene.moments.time[:, None] - at[..., None], 0.0)
-        width = intervals.length.repeat(samples, axis=1)[..., None] / CELLS
-        onsets = np.maximum(at[..., None] + width * np.linspace(-0.4, 0.4, 5), 0.0)
-        shares = np.full(onsets.shape, 0.2)
-    else:
-        log_prior, first = log_of(intervals.weights(early)), np.arange(count)
-        since = np.full((1, 1, 1), LONG_S)
-        onsets, shares = intervals.samples(early)
-    angle = _offset_angle(scene, motor, mode, since)
-    moving = _Motor(scene, motor, False, angle, first)
-    low, high = sizes.ends
-    grid = coarse_sizes(low, high)
-    grid = np.concatenate([-grid[::-1], grid]) if mode.signed else grid
-    grid = np.tile(grid, (scene.moments.runs, 1))
-    least = -high if mode.signed else low
-    best = moving.best(grid, alike=not growing)
-    x = moving.refined(best, np.full((1, 1), least), np.full((1, 1), high))
-    slope = np.sqrt(np.mean(moving.slope(x, ARRIVED) ** 2, axis=-1))
-    deviation = np.minimum(FREE_RAD / np.maximum(slope, 1e-6), 0.5 * high)
-    prior = _size_prior(sizes, mode.signed)
-    return moving.rows(x, deviation**2, log_prior, prior, (onsets, shares))
-
-
-def moment_intervals(scene: Scene) -> OnsetIntervals:
-    """Return the time in which an onset affects each moment first: up to that moment."""
-    end = scene.moments.time
-    return OnsetIntervals(np.concatenate([np.zeros_like(end[:, :1]), end[:, :-1]], axis=1), end)
-
-
-def _offset_angle(scene: Scene, motor: int, mode: FaultMode, since: FloatArray) -> Angle:
-    """Return the settled angle of a motor by the size of its fault.
-
-    Args:
-        scene: The runs.
-        motor: Index of the motor.
-        mode: Its mode.
-        since: For how long the fault has been there, (run, row, moment) [s].
-    """
-    moments, model = scene.moments, scene.model
-    travel = np.abs(moments.target - moments.origin)[..., motor]
-    compliance, payload = np.asarray(model.settling.compliance), model.settling.payload
-
-    def angle(x: FloatArray, outcome: IntArray) -> FloatArray:
-        settled = taken(scene.pose, outcome)
-        target, direction = (
-            taken(values, outcome)[..., motor] for values in (moments.base, moments.direction)
-        )
-        load = np.zeros_like(target)
-        if mode.needs_compliance:
-            load = sag(model.twin.robot, settled, compliance, payload)[..., motor]
-        parts = (target - direction * travel[:, None], target, direction, load)
-        origin, goal, way, weight = (part[..., None] for part in parts)
-        arrival = Arrival(origin, goal, way, since[..., None], weight)
-        off = mode.settled_offset(x[:, :, None], arrival)
-        return settled[..., motor, None] + off
-
-    return angle
-
-
-def _size_prior(sizes: SizePrior, signed: bool) -> AmountPrior:
-    sides = 2.0 if signed else 1.0
-    ranges = [
-        (low, high, share) for (low, high), share in zip(sizes.ranges, sizes.shares, strict=True)
-    ]
-
-    def log_density(x: FloatArray, run: IntArray, row: IntArray) -> FloatArray:
-        del run, row
-        size = np.abs(x) if signed else x
-        parts = [
-            np.where((size >= low) & (size <= high), share / (sides * (high - low)), 0.0)
-            for low, high, share in ranges
-        ]
-        return log_of(np.sum(parts, axis=0))
-
-    return log_density

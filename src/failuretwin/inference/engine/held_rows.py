@@ -1,0 +1,130 @@
+"""A motor that is held from some time on: one angle for all moments after it.
+
+Each onset is a row: on the plateau, where the motor had settled, or on the ramp, anywhere.
+
+Section: docs/inference.md#hypotheses
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from failuretwin.core.numerics import log_of
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.inference.engine.moved_motor import FREE_RAD, Angle, MovedMotor
+from failuretwin.inference.engine.rows import Rows, Scene
+from failuretwin.inference.faults.priors import OnsetIntervals, plateau_or_ramp
+
+GRID = 61
+"""Held angles among which the best is looked for."""
+TIED = 2.0
+"""Deviation of a held angle from where the motor had settled, in its scatter."""
+MARGIN = 4.0
+"""What a motor that stops on its ramp may be beyond its ends, in its scatter."""
+BEYOND = 0.1
+"""Share of its travel by which a motor may be held beyond its ends."""
+POINTS = np.linspace(0.05, 0.95, 10)
+"""Where in a stretch of time onsets are sampled, as shares of its length."""
+LAG_DOUBT_S = 0.03
+"""Deviation of one motor's lag about the mean of the robot [s]: it widens the onset's interval."""
+
+
+def held_rows(scene: Scene, motor: int) -> Rows:
+    """Return the rows of a stuck motor: each onset, on the plateau and anywhere else."""
+    moments, priors = scene.moments, scene.priors
+    count, scatter = moments.count, max(float(scene.model.scatter[motor]), 1e-4)
+    low, high = held_range(scene, motor)
+    goal = scene.settled[..., motor]
+    off = goal - moments.base[:, :, 0, motor]
+    was = moments.origin[..., motor] + np.concatenate([off[:, :1], off[:, :-1]], axis=1)
+    intervals = stuck_intervals(scene, motor)
+    known, share = priors.onset.known_s, priors.onset.free
+    weight = intervals.weights(priors.onset.before_run("stuck"))
+    if known is not None:
+        weight = intervals.holding(known)
+    first = np.repeat(np.arange(count), 2)
+    moving = MovedMotor(scene, motor, True, _held_angle(count), first)
+    later = MovedMotor(scene, motor, True, _held_angle(count), np.arange(count))
+    best = later.best(np.linspace(low, high, GRID, axis=1), alike=True)
+    free = later.refined(best, low[:, None], high[:, None])
+    log_prior = np.stack(
+        [
+            log_of(weight[..., 0]) + np.log1p(-share),
+            log_of(weight[..., 1] + share * weight[..., 0]),
+        ],
+        axis=2,
+    )
+    tied = np.tile([True, False], count)
+    variance = np.where(tied, (TIED * scatter) ** 2, FREE_RAD**2) * np.ones((moments.runs, 1))
+    ends = np.repeat(np.stack([was, goal]), 2, axis=2)
+    start, stop = ends.min(axis=0) - MARGIN * scatter, ends.max(axis=0) + MARGIN * scatter
+    centre = _flat(was, free)
+
+    def amount_prior(x: FloatArray, run: IntArray, row: IntArray) -> FloatArray:
+        begin, end = start[run, row, None], stop[run, row, None]
+        between = np.where((x >= begin) & (x <= end), -np.log(end - begin), -np.inf)
+        anywhere = np.log(share) - np.log(high - low)[run, None]
+        ramp = np.logaddexp(np.log1p(-share) + between, anywhere)
+        width = variance[run, row, None]
+        normal = -0.5 * ((x - centre[run, row, None]) ** 2 / width + np.log(2.0 * np.pi * width))
+        return np.where(tied[row, None], normal, ramp)
+
+    onset = _stuck_onsets(intervals, was, goal, centre)
+    if known is not None:
+        onset = np.full_like(onset[0], known), onset[1]
+    return moving.rows(
+        centre, variance, _flat(log_prior[..., 0], log_prior[..., 1]), amount_prior, onset
+    )
+
+
+def _flat(plateau: FloatArray, ramp: FloatArray) -> FloatArray:
+    """Return values of plateaus and ramps (run, moment) as those of rows, (run, row)."""
+    return np.stack([plateau, ramp], axis=2).reshape(len(plateau), -1)
+
+
+def _held_angle(count: int) -> Angle:
+    def angle(x: FloatArray, outcome: IntArray) -> FloatArray:
+        del outcome
+        return np.repeat(x[:, :, None], count, axis=2)
+
+    return angle
+
+
+def held_range(scene: Scene, motor: int) -> tuple[FloatArray, FloatArray]:
+    """Return the lowest and the highest angle at which a motor may be held, (run,) [rad] each."""
+    robot, moments = scene.model.twin.robot, scene.moments
+    low, high = robot.travel[motor]
+    margin = BEYOND * (high - low)
+    if not robot.slides[motor]:  # beyond a full turn all angles come again
+        margin = min(margin, max(0.0, np.pi - 0.5 * (high - low)))
+    told = np.concatenate([moments.origin[:, :1, motor], moments.target[..., motor]], axis=1)
+    lowest, highest = told.min(axis=1), told.max(axis=1)
+    return np.minimum(low, lowest) - margin, np.maximum(high, highest) + margin
+
+
+def stuck_intervals(scene: Scene, motor: int) -> OnsetIntervals:
+    """Return plateau and ramp before each moment, (run, moment, plateau | ramp) [s]."""
+    moments, model = scene.moments, scene.model
+    start = moments.start + model.lag_s
+    ramp = moments.ramp[..., motor] * (1.0 - model.shortening)
+    return plateau_or_ramp(start, start + ramp)
+
+
+def _stuck_onsets(
+    intervals: OnsetIntervals, was: FloatArray, goal: FloatArray, centre: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return samples of the onset of each row: anywhere on a plateau, on a ramp where it stands."""
+    begin, length = np.nan_to_num(intervals.begin), intervals.length
+    onset = begin[..., None] + POINTS * length[..., None]  # (run, moment, part, sample)
+    travel = goal - was
+    safe = np.where(np.abs(travel) > 1e-6, travel, 1.0)
+    free = centre.reshape(*was.shape, 2)[..., 1]
+    passed = np.clip((free - was) / safe, 0.0, 1.0)
+    on_ramp = begin[..., 1] + passed * length[..., 1]
+    spread = LAG_DOUBT_S * np.linspace(-1.7, 1.7, len(POINTS))
+    ramp = np.maximum(on_ramp[..., None] + spread, 0.0)
+    anywhere = np.concatenate([onset[..., 0, :], onset[..., 1, :]], axis=-1)
+    within = ((free - was) / safe > -0.05) & ((free - was) / safe < 1.05)
+    ramp = np.where(within[..., None], ramp, anywhere[..., ::2])
+    found = np.stack([onset[..., 0, :], ramp], axis=2).reshape(len(was), -1, len(POINTS))
+    return found, np.full(found.shape, 1.0 / len(POINTS))

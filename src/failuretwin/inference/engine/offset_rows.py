@@ -1,0 +1,113 @@
+"""A motor that settles off its target by a size that holds for the run, or by one that grows.
+
+Section: docs/inference.md#hypotheses
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from failuretwin.core.numerics import log_of
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.digital_model.settling import sag
+from failuretwin.failure_behavior.fault import Arrival
+from failuretwin.failure_behavior.mode import FaultMode, Signature
+from failuretwin.inference.engine.moved_motor import ARRIVED, FREE_RAD, Angle, MovedMotor, taken
+from failuretwin.inference.engine.rows import AmountPrior, Rows, Scene
+from failuretwin.inference.faults.fault_sizes import SizePrior, coarse_sizes
+from failuretwin.inference.faults.priors import OnsetIntervals
+
+LONG_S = 10.0
+"""A fault that does not change has been there for so long [s]."""
+CELLS = 3
+"""Onsets within a stretch of time to sum over, of a fault that grows."""
+
+
+def offset_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
+    """Return the rows of a fault whose size holds for the run, with each onset."""
+    early = scene.priors.onset.before_run(mode.mode)
+    sizes = scene.priors.sizes_of(mode, scene.model, motor)
+    intervals = moment_intervals(scene)
+    count, growing = scene.moments.count, mode.signature is Signature.GROWING_OFFSET
+    if growing:
+        points = (np.arange(CELLS) + 0.5) / CELLS
+        onset, share = intervals.samples(early, points)  # (run, moment, sample)
+        samples = onset.shape[-1]
+        log_prior = log_of(intervals.weights(early)[..., None] * share).reshape(len(onset), -1)
+        first = np.repeat(np.arange(count), samples)
+        at = onset.reshape(len(onset), -1)
+        since = np.maximum(scene.moments.time[:, None] - at[..., None], 0.0)
+        width = intervals.length.repeat(samples, axis=1)[..., None] / CELLS
+        onsets = np.maximum(at[..., None] + width * np.linspace(-0.4, 0.4, 5), 0.0)
+        shares = np.full(onsets.shape, 0.2)
+    else:
+        log_prior, first = log_of(intervals.weights(early)), np.arange(count)
+        since = np.full((1, 1, 1), LONG_S)
+        onsets, shares = intervals.samples(early)
+    angle = _offset_angle(scene, motor, mode, since)
+    moving = MovedMotor(scene, motor, False, angle, first)
+    low, high = sizes.ends
+    grid = coarse_sizes(low, high)
+    grid = np.concatenate([-grid[::-1], grid]) if mode.signed else grid
+    grid = np.tile(grid, (scene.moments.runs, 1))
+    least = -high if mode.signed else low
+    best = moving.best(grid, alike=not growing)
+    x = moving.refined(best, np.full((1, 1), least), np.full((1, 1), high))
+    slope = np.sqrt(np.mean(moving.slope(x, ARRIVED) ** 2, axis=-1))
+    deviation = np.minimum(FREE_RAD / np.maximum(slope, 1e-6), 0.5 * high)
+    prior = _size_prior(sizes, mode.signed)
+    return moving.rows(x, deviation**2, log_prior, prior, (onsets, shares))
+
+
+def moment_intervals(scene: Scene) -> OnsetIntervals:
+    """Return the time in which an onset affects each moment first: up to that moment."""
+    end = scene.moments.time
+    return OnsetIntervals(np.concatenate([np.zeros_like(end[:, :1]), end[:, :-1]], axis=1), end)
+
+
+def _offset_angle(scene: Scene, motor: int, mode: FaultMode, since: FloatArray) -> Angle:
+    """Return the settled angle of a motor by the size of its fault.
+
+    Args:
+        scene: The runs.
+        motor: Index of the motor.
+        mode: Its mode.
+        since: For how long the fault has been there, (run, row, moment) [s].
+    """
+    moments, model = scene.moments, scene.model
+    travel = np.abs(moments.target - moments.origin)[..., motor]
+    compliance, payload = np.asarray(model.settling.compliance), model.settling.payload
+
+    def angle(x: FloatArray, outcome: IntArray) -> FloatArray:
+        settled = taken(scene.pose, outcome)
+        target, direction = (
+            taken(values, outcome)[..., motor] for values in (moments.base, moments.direction)
+        )
+        load = np.zeros_like(target)
+        if mode.needs_compliance:
+            load = sag(model.twin.robot, settled, compliance, payload)[..., motor]
+        parts = (target - direction * travel[:, None], target, direction, load)
+        origin, goal, way, weight = (part[..., None] for part in parts)
+        arrival = Arrival(origin, goal, way, since[..., None], weight)
+        off = mode.settled_offset(x[:, :, None], arrival)
+        return settled[..., motor, None] + off
+
+    return angle
+
+
+def _size_prior(sizes: SizePrior, signed: bool) -> AmountPrior:
+    sides = 2.0 if signed else 1.0
+    ranges = [
+        (low, high, share) for (low, high), share in zip(sizes.ranges, sizes.shares, strict=True)
+    ]
+
+    def log_density(x: FloatArray, run: IntArray, row: IntArray) -> FloatArray:
+        del run, row
+        size = np.abs(x) if signed else x
+        parts = [
+            np.where((size >= low) & (size <= high), share / (sides * (high - low)), 0.0)
+            for low, high, share in ranges
+        ]
+        return log_of(np.sum(parts, axis=0))
+
+    return log_density
