@@ -54,7 +54,14 @@ def serve(port: int) -> None:
         def tiles(self) -> list[Tile]:
             now = datetime.now(UTC)
             many = [
-                Tile(f"hall_{k % 9}-arm_{k}", "armpi_fpv", WORST_FIRST[k % 6], "", "said", now)
+                Tile(
+                    f"hall_{k % 9}-arm_{k}",
+                    "armpi_fpv",
+                    WORST_FIRST[k % len(WORST_FIRST)],
+                    "",
+                    "said",
+                    now,
+                )
                 for k in range(ROBOTS)
             ]
             return [*super().tiles(), *many]

@@ -20,9 +20,9 @@ from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
 
 
-def glance(days=1.0, verdict_state="healthy", faults=None):
+def glance(days=1.0, verdict_state="healthy", faults=None, remarks=()):
     at = None if days is None else NOW - timedelta(days=days)
-    return RobotGlance("hall-arm", "armpi_fpv", at, verdict_state, "said", faults or {})
+    return RobotGlance("hall-arm", "armpi_fpv", at, verdict_state, "said", faults or {}, remarks)
 
 
 @pytest.mark.parametrize(
@@ -39,6 +39,32 @@ def glance(days=1.0, verdict_state="healthy", faults=None):
 def test_the_state_of_a_stored_robot(one, expected):
     tile = state.stored_tile(one, NOW)
     assert (tile.state, tile.site) == (expected, "hall")
+
+
+DOUBT = "the log does not fit the profile (97.0 % sure): the sense of motor 2 is wrong"
+
+
+@pytest.mark.parametrize(
+    ("given", "states"),
+    [
+        ({}, (state.SET_UP,)),
+        ({"verdict_state": "cannot tell"}, (state.SET_UP,)),
+        ({"faults": {"motor_3:stuck": True}}, (state.ALARM, state.SET_UP)),
+        ({"days": 31.0}, (state.STALE, state.SET_UP)),
+    ],
+)
+def test_a_robot_whose_set_up_is_uncertain_is_shown_so(given, states):
+    tile = state.stored_tile(glance(**given, remarks=("", "readings glitch", DOUBT)), NOW)
+    assert (tile.states, tile.set_up) == (states, DOUBT)
+    assert DOUBT in tile.said
+    assert tile.record()["states"] == states
+
+
+def test_an_arm_whose_fleet_doubts_its_set_up_is_shown_so():
+    robot = {"state": "undecided", "cause": DOUBT, "heard": 100.0}
+    status = {"partitions": {"p1": {"at": 100.0, "robots": {"a": robot}}}}
+    (tile,) = state.fleet_tiles(status, {}, 101.0)
+    assert (tile.states, tile.said) == ((state.SET_UP,), DOUBT)
 
 
 def test_the_worst_robot_comes_first():

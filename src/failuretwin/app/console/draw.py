@@ -38,10 +38,12 @@ def heading(words: str, level: int = 2) -> ui.label:
     return text(words, f"h{level}")
 
 
-def badge(state: str) -> ui.label:
-    """Draw a state by word, sign and colour."""
-    words = f"{texts.SIGNS[state]} {texts.STATES[state]}"
-    return text(words, "span").classes(f"state state-{state}")
+def badges(states: Sequence[str]) -> None:
+    """Draw states by word, sign and colour."""
+    with ui.element("p").classes("flex gap-2"):
+        for state in states:
+            words = f"{texts.SIGNS[state]} {texts.STATES[state]}"
+            text(words, "span").classes(f"state state-{state}")
 
 
 class Choice:

@@ -28,6 +28,7 @@ YEAR_S = 31_536_000
 COLOURS = {
     "alarm": "#b3261e",
     "suspected": "#8a5a00",
+    "set_up": "#96318f",
     "undecided": "#6b4fa0",
     "stale": "#5a6470",
     "waiting": "#5a6470",

@@ -26,6 +26,7 @@ from failuretwin.decision.streaming.fleet import MOVEMENTS, SILENCE_S
 from failuretwin.decision.streaming.monitor import FaultMonitor
 from failuretwin.decision.streaming.set_up_watch import PROOF
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+from failuretwin.inference.explanation import set_up_doubt
 
 KEPT_S = 600.0
 """Time of a live robot that can be replayed [s]."""
@@ -203,11 +204,12 @@ class LiveRobot(Sink):
         if waiting and self._heard is not None and word == "STALE":
             silent = (datetime.now(UTC) - self._heard).total_seconds() > SILENCE_S
             state = shown.STALE if silent else shown.WAITING
-        set_up = own.monitor.set_up
-        if set_up and state == shown.HEALTHY:
-            state, said = shown.UNDECIDED, texts.SET_UP.format(finding=set_up)
+        diagnosis = shadow.snapshot.answer.diagnosis
+        remarks = [] if diagnosis is None else [diagnosis.undecided, *diagnosis.quality]
+        doubt = own.monitor.set_up or set_up_doubt(remarks)
         mode = shown.modes_of([alarm.cause]) if alarm.cause else ""
-        return Tile(own.name, own.known.robot.name, state, mode, printable(said), self._heard)
+        tile = Tile(own.name, own.known.robot.name, state, mode, printable(said), self._heard)
+        return tile.doubted(printable(doubt))
 
     def _end(self, why: str) -> None:
         """Show the robot as stale, with its last word."""

@@ -47,7 +47,7 @@ def show(visit: Visit, name: str) -> None:
         if live is not None:
             LivePage(visit, live)
         else:
-            draw.badge(tile.state)
+            draw.badges(tile.states)
             draw.text(tile.said)
             draw.text(visit.time(tile.heard)).classes("soft")
             _stored_arm(visit, name, known)
@@ -200,7 +200,7 @@ class LivePage:
         self._verdict.clear()
         with self._verdict:
             draw.heading(texts.VERDICT)
-            draw.badge(view.tile.state)
+            draw.badges(view.tile.states)
             draw.text(view.tile.said)
             self._say_alarm(view)
             if view.diagnosis is not None:

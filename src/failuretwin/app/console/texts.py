@@ -24,6 +24,7 @@ NO_PROFILE = "The profile of this robot is not known here, so its arm is not dra
 STATES = {
     "alarm": "alarm",
     "suspected": "suspected",
+    "set_up": "set-up uncertain",
     "undecided": "undecided",
     "stale": "stale",
     "waiting": "no verdict yet",
@@ -32,6 +33,7 @@ STATES = {
 SIGNS = {
     "alarm": "✕",
     "suspected": "!",
+    "set_up": "≠",
     "undecided": "?",
     "stale": "=",
     "waiting": "…",
@@ -40,14 +42,11 @@ SIGNS = {
 LAST_WORD = "last word: {said}"
 NEVER = "nothing was heard yet"
 SIMULATING = "The demo simulates its year of history: {done} of {all} robots are there."
-SET_UP = "the set-up is uncertain: {finding}"
+SET_UP = "{said}; set-up: {finding}"
 
 WALL_TEXTS = {
     "search": "Search",
-    "kind": "Kind",
-    "site": "Site",
-    "mode": "Fault mode",
-    "state": "State",
+    "filters": {"kind": "Kind", "site": "Site", "mode": "Fault mode", "states": "State"},
     "all": "all",
     "none": "No robot matches.",
     "heard": "heard",

@@ -23,7 +23,7 @@ STYLE = """
 .wall a { display: flex; flex-direction: column; gap: .15rem; height: 100%; padding: .5rem .7rem;
   border: 1px solid var(--line); border-left-width: .5rem; border-radius: .4rem; color: inherit;
   background: var(--soft); text-decoration: none; overflow-wrap: anywhere; }
-.wall a .state { align-self: start; }
+.wall a .badges { display: flex; flex-wrap: wrap; gap: .3rem; }
 .wall .said { font-size: .9rem; max-height: 4.2em; overflow: hidden; }
 """ + "\n".join(f".wall .edge-{name} {{ border-left-color: {c}; }}" for name, c in COLOURS.items())
 
