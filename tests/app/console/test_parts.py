@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import time
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 pytest.importorskip("nicegui")
 
-from failuretwin.app.console import act, state, users
+from failuretwin.app.console import act, state, texts, users
 from failuretwin.app.console.checking import HANGS_S, Stoppable, beat_watch
 from failuretwin.connection.links.base import Order, Reading
 from failuretwin.core.errors import InputError
@@ -176,9 +177,8 @@ def test_a_stopped_arm_is_told_to_stay_where_it_was_read():
 
 
 def test_a_check_stops_by_itself_if_the_console_hangs_or_its_page_is_gone():
-    import time
-
     now = time.monotonic()
-    assert beat_watch(lambda: now, lambda: True)() == ""
-    assert "hangs" in beat_watch(lambda: now - HANGS_S - 1.0, lambda: True)()
-    assert "gone" in beat_watch(lambda: now, lambda: False)()
+    late = now - HANGS_S - 1.0
+    assert beat_watch(lambda: now, lambda: now)() == ""
+    assert beat_watch(lambda: late, lambda: now)() == texts.HANG
+    assert beat_watch(lambda: now, lambda: late)() == texts.GONE

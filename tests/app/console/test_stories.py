@@ -22,7 +22,7 @@ pytest.importorskip("selenium", reason="selenium is not installed")
 from selenium.common.exceptions import WebDriverException
 from selenium.webdriver.common.keys import Keys
 
-SICK, LIVE, SILENT = "hall_2-arm_7", "hall_1-arm_2", "hall_1-arm_3"
+SICK, LIVE, SILENT, DOUBTED = "hall_2-arm_7", "hall_1-arm_2", "hall_1-arm_3", "hall_2-arm_8"
 PICTURES = os.environ.get("FAILURETWIN_PICTURES")
 """Folder for the pictures of README and docs; empty: none are taken."""
 LONGEST_S = 180.0
@@ -126,6 +126,15 @@ def test_the_wall_is_searched_and_filtered(person):
     person.write("search", "arm_7")
     person.sees("1 of ")
     person.write("search", "nobody")
+    person.sees("No robot matches.")
+    person.go("/")
+    person.sees(DOUBTED)
+    person.find("//select[@name='states']/option[contains(., 'set-up uncertain')]").click()
+    person.sees("1 of ", DOUBTED, "motor 2 turns the other way")
+    for key, value in (("kind", "armpi_fpv"), ("site", "hall_2")):
+        person.find(f"//select[@name='{key}']/option[contains(., '{value}')]").click()
+        person.sees("1 of ", DOUBTED)
+    person.find("//select[@name='site']/option[contains(., 'hall_1')]").click()
     person.sees("No robot matches.")
     person.go("/")
 

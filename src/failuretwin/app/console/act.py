@@ -31,6 +31,8 @@ from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 LINES_S = 0.5
 """Time between two updates of a check [s]."""
 LONGEST_CHECK_S = 120.0
+BEAT = "<script>setInterval(() => window.socket?.connected && emitEvent('beat'), 1000)</script>"
+"""Signs of a page that it works: its arm is stopped if they stay away."""
 SUFFIXES = (".nc", ".csv", ".mat", ".bag", ".mcap", ".db3", ".parquet")
 """Files that are taken."""
 LABELS = f"""for (const one of document.querySelectorAll(".q-uploader__input, .q-uploader a"))
@@ -80,6 +82,13 @@ class CheckPage:
         self._lines = ui.element("div").props('role="log" aria-live="polite"')
         self._shown: list[object] = []
         ui.timer(LINES_S, self._update)
+        self._beat_s = time.monotonic()
+        ui.on("beat", self._beat)
+        ui.add_body_html(BEAT)
+
+    def _beat(self) -> None:
+        """Note that the page works."""
+        self._beat_s = time.monotonic()
 
     def _start(self) -> None:
         desk, known, name = self._visit.desk, self._known, self._name
@@ -88,12 +97,12 @@ class CheckPage:
         if desk.check is not None and desk.check.running:
             ui.notify(texts.BUSY, type="negative")
             return
-        client = ui.context.client
+        self._beat()
         desk.check = CheckRun(
             name or known.robot.name,
             Checking(known, SafetyGate(known.robot)),
             lambda stack: _arm(desk, known, name, self._real, stack),
-            beat_watch(lambda: desk.beat_s, lambda: client.has_socket_connection),
+            beat_watch(lambda: desk.beat_s, lambda: self._beat_s),
             lambda result: _keep(desk, known, name, result),
         )
         seconds = float(self._seconds.value or 20.0)
@@ -121,7 +130,9 @@ def _arm(desk: Desk, known: CalibratedRobot, name: str, real: bool, stack: ExitS
 
     live = desk.live.get(name)
     if real and live is not None:
-        return commander_of(ArmOptions(live.settings.place, (), True, None), known, 0, stack)
+        return commander_of(
+            ArmOptions(live.settings.place, (), True, live.settings.topics), known, 0, stack
+        )
     faults = live.settings.faults if live is not None else ()
     emulation = emulation_with(faults, known_arm(known.robot), int(time.time()))
     return stack.enter_context(EmulatedArm(emulation, Pace(desk.speed)))

@@ -33,15 +33,17 @@ ARMS = {
     "hall_1-arm_3": ((), 30.0),
 }
 """Emulated arms: their faults, and when each falls silent [s]; 0: never."""
-LOGS = (("monday", 0), ("tuesday", 2), ("wednesday", 3))
-"""Logs of a robot with a stuck motor: name and number of the simulated run."""
+LOGS = {
+    "hall_2-arm_7": (("monday", 0), ("tuesday", 2), ("wednesday", 3)),
+    "hall_2-arm_8": (("thursday", 1),),
+}
+"""Logs of robots: name and number of the simulated run. The last two are of a stuck motor."""
+REVERSED = {"hall_2-arm_8": 1}
+"""Robots whose set-up is wrong: the number of the motor whose commands have the other sign."""
 
 
 def demo_store(folder: Path, known: CalibratedRobot) -> Store:
-    """Return a store that a thread fills with a robot whose logs are in the folder.
-
-    Its motor 3 is stuck since the second log.
-    """
+    """Return a store that a thread fills with robots whose logs are in the folder."""
     store = open_store(folder / "robots.db", create=True)
     Thread(target=_write_logs, args=(store, folder, known), name="logs", daemon=True).start()
     return store
@@ -52,17 +54,23 @@ def _write_logs(store: Store, folder: Path, known: CalibratedRobot) -> None:
         known.robot, ["healthy", "motor_3:stuck"], 2, seed=7, imperfections=known.imperfections
     )
     runs, midnight = simulate(plan), last_midnight().timestamp()
-    record = RobotRecord(store, "hall_2-arm_7", known.robot)
     diagnoser = BayesDiagnoser(known.twin, known.imperfections)
-    for day, (name, number) in enumerate(LOGS):
-        path, at = folder / f"{name}.nc", midnight - (len(LOGS) - day) * DAY_S
-        one = runs.isel(run=[number]).assign_coords(run=[name]).drop_vars(_TRUTH, errors="ignore")
-        one.to_netcdf(path)
-        os.utime(path, (at, at))
-        record.remember(diagnoser.diagnose(one), log_file(path))
+    for robot, logs in LOGS.items():
+        record = RobotRecord(store, robot, known.robot)
+        motors = np.arange(len(known.robot.motors))
+        signs = np.where(motors == REVERSED.get(robot, -1), -1.0, 1.0)
+        for day, (name, number) in enumerate(logs):
+            path, at = folder / f"{name}.nc", midnight - (len(logs) - day) * DAY_S
+            one = runs.isel(run=[number]).assign_coords(run=[name])
+            one = one.drop_vars(_TRUTH, errors="ignore")
+            one = one.assign({part: signs * one[part] for part in _COMMANDED if part in one})
+            one.to_netcdf(path)
+            os.utime(path, (at, at))
+            record.remember(diagnoser.diagnose(one), log_file(path))
 
 
 _TRUTH = ["fault", "fault_detail", "onset", "magnitude"]
+_COMMANDED = ("command", "target")
 
 
 def write_history(store: Store, robots: int, years: float) -> subprocess.Popen[bytes]:

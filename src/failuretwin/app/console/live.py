@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from threading import Event, Thread
 
 import numpy as np
@@ -58,6 +59,7 @@ class LiveSettings:
         wait_s: Longest delay of commands [s].
         faults: Faults of an emulated arm, which its emulated check has too.
         place: Network of the real arm; empty: emulated or a log.
+        topics: File that names its topics; None: as usual.
     """
 
     name: str
@@ -67,6 +69,7 @@ class LiveSettings:
     wait_s: float = 0.0
     faults: tuple[str, ...] = ()
     place: str = ""
+    topics: Path | None = None
 
 
 class LiveRobot(Sink):

@@ -104,7 +104,7 @@ STOP_NOTE = "No emergency stop: keep the real one in reach. It works from any wi
 STOPPED_BY = "stopped by {name}"
 STOP_SENT, NO_CHECK = "Told to stop.", "No check is running."
 HANG = "the console hangs"
-GONE = "the page that started the check is gone"
+GONE = "the page that started the check is closed, or hangs"
 BUSY = "A check is running. Wait for it, or stop it."
 STARTED, FINISHED = "the check of {robot} has begun", "the check is over"
 
