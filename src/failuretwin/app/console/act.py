@@ -7,6 +7,7 @@ import tempfile
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from html import escape
 from pathlib import Path
 
@@ -22,11 +23,13 @@ from failuretwin.app.reports.check_report import check_lines, closing_lines
 from failuretwin.app.terminal import Table
 from failuretwin.connection.links.base import Commander
 from failuretwin.connection.links.replay import Pace
+from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.foreign import printable
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.robot_state import robot_state
 from failuretwin.decision.test_motions.health_check import Checking, CheckResult
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+from failuretwin.inference.diagnoser import BayesDiagnoser
 
 LINES_S = 0.5
 """Time between two updates of a check [s]."""
@@ -117,9 +120,9 @@ class CheckPage:
         self._lines.clear()
         with self._lines:
             for line in check.lines:
-                draw.text(line)
+                draw.text(self._visit.words(line, self._known.robot))
             if check.result is not None:
-                _result(check.result, self._known)
+                _result(check.result, self._known, self._visit)
 
 
 def _arm(desk: Desk, known: CalibratedRobot, name: str, real: bool, stack: ExitStack) -> Commander:
@@ -146,12 +149,13 @@ def _keep(desk: Desk, known: CalibratedRobot, name: str, result: CheckResult) ->
         desk.look()
 
 
-def _result(result: CheckResult, known: CalibratedRobot) -> None:
+def _result(result: CheckResult, known: CalibratedRobot, visit: Visit) -> None:
+    words = partial(visit.words, robot=known.robot)
     for part in [*check_lines(result, known.robot, 0.0), *closing_lines(result, known.robot)]:
         if isinstance(part, Table):
-            draw.table(part.headings, part.rows)
+            draw.table(part.headings, [[words(cell) for cell in row] for row in part.rows])
         else:
-            draw.text(part)
+            draw.text(words(part))
 
 
 # Logs.
@@ -229,10 +233,14 @@ async def _show_imported(visit: Visit, found: Imported, kind: str) -> None:
     known = visit.desk.of_kind(kind)
     if known is None:
         return
-    state = robot_state(found.diagnoses, known.robot)
-    draw.heading(state.headline)
-    draw.text(state.step)
-    draw.table((texts.RUN, texts.VERDICT), [[one.run, one.verdict] for one in found.diagnoses])
+    state, words = (
+        robot_state(found.diagnoses, known.robot),
+        partial(visit.words, robot=known.robot),
+    )
+    draw.heading(words(state.headline))
+    draw.text(words(state.step))
+    rows = [[one.run, words(one.verdict)] for one in found.diagnoses]
+    draw.table((texts.RUN, texts.VERDICT), rows)
     for line in found.stored or [texts.NOT_STORED]:
         draw.text(line)
     number = await draw.worked(_report, visit.desk, found, known)
@@ -252,6 +260,16 @@ def _report(desk: Desk, found: Imported, known: CalibratedRobot) -> int:
     for old in sorted(desk.reports)[:-REPORTS]:
         del desk.reports[old]
     return number
+
+
+def run_report(desk: Desk, name: str, row: int) -> str:
+    """Return the page for technicians on a run of a robot in the store."""
+    try:
+        runs, known = desk.stored_log(name, row)
+    except FailureTwinError as error:
+        return f"<p>{escape(printable(str(error)))}</p>"
+    diagnoses = BayesDiagnoser(known.twin, known.imperfections).diagnose(runs)
+    return report_page(desk, _report(desk, Imported(runs, diagnoses, ()), known))
 
 
 def report_page(desk: Desk, number: int) -> str:

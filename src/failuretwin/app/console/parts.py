@@ -23,7 +23,11 @@ MOVEMENT = re.compile(r"movement (\d+)\b")
 
 
 def reasons(
-    diagnosis: Diagnosis, trace: Trace, robot: Robot, movement: Callable[[str, float], object]
+    visit: Visit,
+    diagnosis: Diagnosis,
+    trace: Trace,
+    robot: Robot,
+    movement: Callable[[str, float], object],
 ) -> None:
     """Draw why, and what to do now; `movement` draws a reason that leads to its time [s]."""
     draw.heading(texts.WHY)
@@ -32,11 +36,11 @@ def reasons(
         found = MOVEMENT.match(line)
         at = starts.get(int(found[1])) if found else None
         if at is not None:
-            movement(line, at)
+            movement(visit.words(line, robot), at)
         elif not line.startswith(STEP):
-            draw.text(line)
+            draw.text(visit.words(line, robot))
     draw.heading(texts.NEXT)
-    draw.text(robot_state([diagnosis], robot).step)
+    draw.text(visit.words(robot_state([diagnosis], robot).step, robot))
 
 
 def motor_table(robot: Robot, diagnosis: Diagnosis) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from nicegui import ui
 
 from failuretwin.app.console import draw, texts
 from failuretwin.app.console.layout import COLOURS, Visit, page
+from failuretwin.app.console.state import Tile
 
 PERIOD_S = 1.0
 """Time between two updates [s]."""
@@ -58,12 +60,15 @@ def show(visit: Visit) -> None:
         wall = Wall()
         ready = False
 
+        def told(tile: Tile) -> Tile:
+            return replace(tile, said=visit.words(tile.said, visit.desk.profile(tile.kind)))
+
         def update() -> None:
             if not ready:
                 return
             trouble.set_text(visit.desk.trouble)
             note.set_text(visit.desk.note)
-            wall.show({tile.name: tile.record() for tile in visit.desk.tiles()})
+            wall.show({tile.name: told(tile).record() for tile in visit.desk.tiles()})
 
         def begin() -> None:
             nonlocal ready
