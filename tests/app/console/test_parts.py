@@ -8,15 +8,18 @@ import pytest
 
 pytest.importorskip("nicegui")
 
-from failuretwin.app.console import act, state, texts, users
+from failuretwin.app.console import act, live, state, texts, users
 from failuretwin.app.console.checking import HANGS_S, Stoppable, beat_watch
+from failuretwin.app.console.live import LiveRobot, LiveSettings
 from failuretwin.connection.links.base import Order, Reading
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.records.overview import RobotGlance
 from failuretwin.data_knowledge.records.store import open_store
 from failuretwin.decision.acting.work import Halted
+from failuretwin.digital_model.calibrated_robot import calibrated
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
+from waiting import wait_for
 
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
 
@@ -182,3 +185,28 @@ def test_a_check_stops_by_itself_if_the_console_hangs_or_its_page_is_gone():
     assert beat_watch(lambda: now, lambda: now)() == ""
     assert beat_watch(lambda: late, lambda: now)() == texts.HANG
     assert beat_watch(lambda: now, lambda: late)() == texts.GONE
+
+
+class Unheard:
+    """A diagnoser of a robot that nobody is heard of."""
+
+    set_up = None
+
+
+def watched(robot, open_source):
+    known = calibrated(robot)
+    return LiveRobot(LiveSettings("arm", known, Unheard(), open_source))
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_robot_whose_watch_fails_or_hangs_is_stale(armpi):
+    def broken(stack):
+        raise ZeroDivisionError("broken")
+
+    failed, hung = watched(armpi, broken), watched(armpi, broken)
+    assert hung.tile.state == state.WAITING
+    failed.start()
+    wait_for(lambda: failed.tile.state == state.STALE)
+    assert failed.tile.said.startswith("the watch has failed: ZeroDivisionError: broken; last word")
+    hung._seen_s = time.monotonic() - live.HANGS_S - 1.0
+    assert (hung.tile.state, hung.tile.said) == (state.STALE, "last word: nothing was heard yet")

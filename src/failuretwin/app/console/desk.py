@@ -115,7 +115,7 @@ class Desk:
         kinds = {name: tile.kind for name, tile in found.items()}
         for tile in self._fleet:
             found[tile.name] = replace(tile, kind=kinds.get(tile.name, tile.kind))
-        found |= {name: robot.view.tile for name, robot in self.live.items()}
+        found |= {name: robot.tile for name, robot in self.live.items()}
         return shown.worst_first(list(found.values()))
 
     @property

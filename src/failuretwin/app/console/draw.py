@@ -102,7 +102,7 @@ class Slider(ui.element, component="slider.js"):
         self.classes("full-width")
         self.on("moved", self._moved, throttle=EVENT_S)
 
-    def move(self, value: float) -> None:
+    def go_to(self, value: float) -> None:
         """Move it."""
         self._take(value)
         self.run_method("show", self.value)

@@ -77,7 +77,7 @@ class Replay:
         button.props("flat").classes("reason")
 
     def _go_to(self, at: float) -> None:
-        self._slider.move(at)
+        self._slider.go_to(at)
 
     def _toggle(self) -> None:
         self._timer.active = not self._timer.active
@@ -85,7 +85,7 @@ class Replay:
 
     def _step(self) -> None:
         end = float(self._trace.time[-1])
-        self._slider.move(self._slider.value + PLAY_S)
+        self._slider.go_to(self._slider.value + PLAY_S)
         if self._slider.value >= end:
             self._toggle()
 

@@ -204,16 +204,16 @@ class LivePage:
 
     def _say(self) -> None:
         """Tell the verdict, unless it stands there."""
-        view = self._live.view
-        said = (view.tile.state, view.tile.said, view.diagnosis, len(view.changes))
+        view, tile = self._live.view, self._live.tile
+        said = (tile.state, tile.said, view.diagnosis, len(view.changes))
         if said == self._said:
             return
         self._said, words, robot = said, self._visit.words, self._known.robot
         self._verdict.clear()
         with self._verdict:
             draw.heading(texts.VERDICT)
-            draw.badges(view.tile.states)
-            draw.text(words(view.tile.said, robot))
+            draw.badges(tile.states)
+            draw.text(words(tile.said, robot))
             self._say_alarm(view)
             if view.diagnosis is not None:
                 trace = self._live.trace()

@@ -41,6 +41,7 @@ SIGNS = {
 }
 LAST_WORD = "last word: {said}"
 NEVER = "nothing was heard yet"
+WATCH_FAILED = "the watch has failed: {why}"
 SIMULATING = "The demo simulates its year of history: {done} of {all} robots are there."
 SET_UP = "{said}; set-up: {finding}"
 
