@@ -19,7 +19,6 @@ from failuretwin.data_knowledge.records.store import open_store
 from failuretwin.decision.acting.work import Halted
 from failuretwin.digital_model.calibrated_robot import calibrated
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
-from waiting import wait_for
 
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
 
@@ -198,15 +197,15 @@ def watched(robot, open_source):
     return LiveRobot(LiveSettings("arm", known, Unheard(), open_source))
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_robot_whose_watch_fails_or_hangs_is_stale(armpi):
     def broken(stack):
         raise ZeroDivisionError("broken")
 
     failed, hung = watched(armpi, broken), watched(armpi, broken)
     assert hung.tile.state == state.WAITING
-    failed.start()
-    wait_for(lambda: failed.tile.state == state.STALE)
+    with pytest.raises(ZeroDivisionError):
+        failed._run()
+    assert failed.tile.state == state.STALE
     assert failed.tile.said.startswith("the watch has failed: ZeroDivisionError: broken; last word")
     hung._seen_s = time.monotonic() - live.HANGS_S - 1.0
     assert (hung.tile.state, hung.tile.said) == (state.STALE, "last word: nothing was heard yet")
