@@ -13,6 +13,7 @@ from console_server import PASSWORD
 SICK, LIVE = "hall_2-arm_7", "hall_1-arm_2"
 TUESDAY = "//tr[td[normalize-space()='tuesday']]"
 PHONE = {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True}
+CONTRAST = {"runOnly": {"type": "rule", "values": ["color-contrast"]}}
 WIDTH = "return document.documentElement.scrollWidth"
 
 
@@ -97,13 +98,15 @@ def test_colours_have_contrast(person, theme):
     axe = pytest.importorskip("axe_selenium_python", reason="axe-selenium-python is missing")
     person.browser.add_cookie({"name": "theme", "value": theme})
     found = []
-    for page in ("/", f"/robot?name={SICK}", "/check"):
+    named = f"name={SICK}"
+    pages = ("/", f"/robot?{named}", f"/history?{named}", f"/replay?{named}&run=2", "/check")
+    for page in pages:
         person.go(page)
         person.find("//main//h1")
         time.sleep(1.0)
         checker = axe.Axe(person.browser)
         checker.inject()
-        wrong = checker.run(options={"runOnly": ["color-contrast"]})["violations"]
+        wrong = checker.run(options=CONTRAST)["violations"]
         found += [(page, node["html"][:200]) for one in wrong for node in one["nodes"]]
     person.browser.delete_cookie("theme")
     assert found == []

@@ -66,7 +66,8 @@ a.reason { display: block; }
 .soft { opacity: .85; font-size: .9rem; }
 /* Of important rules those of the first layer win, also over "no-outline" of Quasar. */
 @layer theme { :focus-visible, .kept, .q-field:has(:focus-visible) { outline-offset: 0 !important;
-  outline: 3px solid #ffbf47 !important; box-shadow: 0 0 0 5px #16191c !important; } }
+  outline: 3px solid #ffbf47 !important; box-shadow: 0 0 0 5px #16191c !important; }
+  .q-btn--outline, .q-btn--flat { color: var(--link) !important; } }
 """ + "\n".join(f".state-{name} {{ background: {colour}; }}" for name, colour in COLOURS.items())
 ZONE_COOKIE = (
     "<script>{const zone='zone='+Intl.DateTimeFormat().resolvedOptions().timeZone;"
