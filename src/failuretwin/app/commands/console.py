@@ -104,7 +104,7 @@ def console(
 
         reached = access.to(url) if url is not None else None
         speed = live.speed or 1.0
-        expected = demo_robots + len(LOGS) if demo else 0
+        expected = len(LOGS) + demo_robots + bool(demo_robots) if demo else 0
         desk = Desk(known, store, reached, arms, move, speed, folder, expected=expected)
         serve(desk, Listening(host, port, sessions))
 
@@ -126,8 +126,9 @@ def _begin_demo(
     store = demo.demo_store(folder, known)
     arms |= demo.demo_arms(known, speed)
     if robots:
-        writer = demo.write_history(store, robots, 1.0)
-        stack.callback(writer.terminate)
+        writer = demo.HistoryWriter(store, folder, known, robots)
+        stack.callback(writer.stop)
+        writer.start()
     return store
 
 

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -38,6 +39,8 @@ LOGS = {
     "hall_2-arm_8": (("thursday", 1),),
 }
 """Logs of robots: name and number of the simulated run. The last two are of a stuck motor."""
+TRACKED, TRACKED_RUNS, TRACKED_SEED = "hall_2-arm_9", 24, 3
+"""Robot whose offsets are followed over two logs, for its remaining life; its runs."""
 REVERSED = {"hall_2-arm_8": 1}
 """Robots whose set-up is wrong: the number of the motor whose commands have the other sign."""
 
@@ -73,16 +76,61 @@ _TRUTH = ["fault", "fault_detail", "onset", "magnitude"]
 _COMMANDED = ("command", "target")
 
 
-def write_history(store: Store, robots: int, years: float) -> subprocess.Popen[bytes]:
-    """Simulate years of a fleet into a store, robot by robot, in a process that is returned.
+@dataclass
+class HistoryWriter:
+    """Writes the past of the demo into its store, in processes that give way to the pages.
 
-    It gives way to the pages.
+    Attributes:
+        store: The store.
+        folder: Folder for logs.
+        known: The robot, calibrated.
+        robots: Robots whose year is simulated.
     """
-    fleet = ["--fleet", str(robots), "--years", str(years), "--seed", str(YEAR_SEED)]
-    command = [sys.executable, "-m", "failuretwin", "simulate", *fleet, "--store", store.name]
-    writer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    os.setpriority(os.PRIO_PROCESS, writer.pid, LOW_PRIORITY)
-    return writer
+
+    store: Store
+    folder: Path
+    known: CalibratedRobot
+    robots: int
+    _process: subprocess.Popen[bytes] | None = None
+    _stopped: bool = False
+
+    def start(self) -> None:
+        """Begin to write."""
+        Thread(target=self._write, name="history", daemon=True).start()
+
+    def stop(self) -> None:
+        """End the process that writes."""
+        self._stopped = True
+        if self._process is not None:
+            self._process.terminate()
+
+    def _write(self) -> None:
+        stored = ["--store", self.store.name]
+        for log in self._tracked_logs():
+            self._run("diagnose", str(log), "--track", "--robot-name", TRACKED, *stored)
+        fleet = ["--fleet", str(self.robots), "--years", "1", "--seed", str(YEAR_SEED)]
+        self._run("simulate", *fleet, *stored)
+
+    def _tracked_logs(self) -> list[Path]:
+        """Write the logs of the robot that is followed, and return them."""
+        healthy = self.known.imperfections
+        plan = Plan(self.known.robot, ["healthy"], TRACKED_RUNS, TRACKED_SEED, healthy)
+        runs, halves, paths = simulate(plan), np.split(np.arange(TRACKED_RUNS), 2), []
+        for name, half, days in zip(("may", "november"), halves, (200, 1), strict=True):
+            path, at = self.folder / f"{name}.nc", last_midnight().timestamp() - days * DAY_S
+            runs.isel(run=half).drop_vars(_TRUTH, errors="ignore").to_netcdf(path)
+            os.utime(path, (at, at))
+            paths.append(path)
+        return paths
+
+    def _run(self, *arguments: str) -> None:
+        """Run a command to its end, unless all is stopped."""
+        if self._stopped:
+            return
+        command, quiet = [sys.executable, "-m", "failuretwin", *arguments], subprocess.DEVNULL
+        self._process = subprocess.Popen(command, stdout=quiet, stderr=quiet)
+        os.setpriority(os.PRIO_PROCESS, self._process.pid, LOW_PRIORITY)
+        self._process.wait()
 
 
 def demo_arms(known: CalibratedRobot, speed: float) -> dict[str, LiveRobot]:

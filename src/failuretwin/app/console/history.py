@@ -227,11 +227,12 @@ def _at_dates(visit: Visit, drift: Drift, dates: list[str], motor: str) -> list[
     for day in dates:
         before = [k for k, at in enumerate(drift.at) if visit.day(at) <= day]
         values.append(before[-1] if before else 0)
-    angle = drift.unit == "rad" and motor in known.motor_names
+    angle = drift.unit.startswith("rad") and motor in known.motor_names
 
     def word(value: float) -> str:
         if angle:
-            return visit.angle(value, known, known.motor_names.index(motor), relative=True)
+            told = visit.angle(value, known, known.motor_names.index(motor), relative=True)
+            return told + drift.unit.removeprefix("rad")
         return f"{value:.4g} {drift.unit}"
 
     told = [f"{word(drift.values[k])} ± {word(abs(drift.deviations[k]))}" for k in values]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 EXPIRY_S = 5.0
 """Time between two looks whether the session has ended [s]."""
 DIGITS = {"deg": 1, "rad": 3, "counts": 0}
-"""Digits after the point, by unit."""
+"""Digits after the point, by unit; small differences have one more."""
 DEGREES = re.compile(r"(?P<place>stuck at )?(?P<value>[+-]?\d+(?:\.\d+)?) deg\b")
 """An angle in a text: where a motor stands, or a difference or speed."""
 CHOICES = {"theme": texts.THEMES, "unit": texts.UNIT_NAMES}
@@ -164,7 +164,7 @@ class Visit:
         if robot.slides[motor]:
             return f"{1e3 * value:.1f} mm"
         told, unit = self._shown(value, robot, relative)
-        return f"{told:.{DIGITS[unit]}f} {unit}"
+        return f"{told:.{DIGITS[unit] + relative}f} {unit}"
 
     def held(self, told: float, robot: Robot, motor: int) -> float:
         """Return the angle [rad] or place [m] that a number in the unit of the reader means."""

@@ -63,9 +63,8 @@ class Replay:
                     draw.text(visit.words(diagnosis.verdict, known.robot))
                     parts.reasons(visit, diagnosis, trace, known.robot, self._button)
                     parts.motor_table(known.robot, diagnosis)
-                parts.asked(
-                    texts.BLIND, texts.ASK_BLIND, lambda: visit.desk.blind_spots(trace, known)
-                )
+                blind = texts.BLIND, texts.ASK_BLIND
+                parts.asked(visit, known.robot, blind, lambda: visit.desk.blind_spots(trace, known))
             with ui.element("section"):
                 self._charts = Charts(known, with_posterior=bool(trace.posterior))
                 draw.later(self._draw_charts)

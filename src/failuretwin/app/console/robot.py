@@ -55,7 +55,8 @@ def show(visit: Visit, name: str) -> None:
         _runs(visit, name, robot)
         if known is not None:
             ReachPart(visit, known)
-        parts.asked(texts.LIFE, texts.ASK_LIFE, lambda: desk.remaining_life(name), texts.LIFE_NOTE)
+        life = texts.LIFE, texts.ASK_LIFE
+        parts.asked(visit, robot, life, lambda: desk.remaining_life(name), texts.LIFE_NOTE)
 
 
 def _stored_arm(visit: Visit, name: str, known: CalibratedRobot | None) -> None:
@@ -170,8 +171,9 @@ class LivePage:
                 draw.heading(texts.CHANGES)
                 self._changes = ui.element("div")
                 parts.asked(
-                    texts.BLIND,
-                    texts.ASK_BLIND,
+                    visit,
+                    robot,
+                    (texts.BLIND, texts.ASK_BLIND),
                     lambda: visit.desk.blind_spots(live.trace(), self._known),
                 )
         self._say()
