@@ -10,6 +10,7 @@ pytest.importorskip("nicegui")
 
 from failuretwin.app.console import act, live, state, texts, users
 from failuretwin.app.console.checking import HANGS_S, Stoppable, beat_watch
+from failuretwin.app.console.layout import Visit
 from failuretwin.app.console.live import LiveRobot, LiveSettings
 from failuretwin.connection.links.base import Order, Reading
 from failuretwin.core.errors import InputError
@@ -209,3 +210,32 @@ def test_a_robot_whose_watch_fails_or_hangs_is_stale(armpi):
     assert failed.tile.said.startswith("the watch has failed: ZeroDivisionError: broken; last word")
     hung._seen_s = time.monotonic() - live.HANGS_S - 1.0
     assert (hung.tile.state, hung.tile.said) == (state.STALE, "last word: nothing was heard yet")
+
+
+@pytest.mark.parametrize(
+    ("unit", "text", "said"),
+    [
+        ("deg", "motor 3 stuck at 26 deg since 0.5 s", "motor 3 stuck at 26 deg since 0.5 s"),
+        ("rad", "motor 3 stuck at 26 deg since 0.5 s", "motor 3 stuck at 0.454 rad since 0.5 s"),
+        (
+            "counts",
+            "motor 3 stuck at 26 deg since 0.5 s",
+            "motor 3 stuck at 392 counts since 0.5 s",
+        ),
+        ("rad", "motor 2 drifts by 9.0 deg/s", "motor 2 drifts by 0.157 rad/s"),
+        ("counts", "misses by about 2.4 deg", "misses by about -10 counts"),
+        ("rad", "+1.80 +- 0.90 deg", "0.031 +- 0.016 rad"),
+        ("counts", "-1.80 +- 0.90 deg", "8 +- 4 counts"),
+        ("rad", "from 90 to 180 deg", "from 1.571 to 3.142 rad"),
+    ],
+)
+def test_angles_in_texts_are_in_the_unit_of_the_reader(armpi, unit, text, said):
+    visit = Visit(None, None, "auto", unit, None)
+    assert visit.words(text, armpi) == said
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad", "counts"])
+def test_an_angle_that_is_typed_is_meant_as_it_is_shown(armpi, unit):
+    visit = Visit(None, None, "auto", unit, None)
+    told = float(visit.angle(0.3, armpi, 2).split()[0])
+    assert visit.held(told, armpi, 2) == pytest.approx(0.3, abs=0.005)

@@ -235,6 +235,8 @@ def _at_dates(visit: Visit, drift: Drift, dates: list[str], motor: str) -> list[
             return told + drift.unit.removeprefix("rad")
         return f"{value:.4g} {drift.unit}"
 
-    told = [f"{word(drift.values[k])} ± {word(abs(drift.deviations[k]))}" for k in values]
+    told = [
+        f"{word(drift.values[k])} ± {word(drift.deviations[k]).removeprefix('-')}" for k in values
+    ]
     change = drift.values[values[1]] - drift.values[values[0]]
     return [*told, word(change)]

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from typing import TYPE_CHECKING
 from zoneinfo import ZoneInfo
 
@@ -26,8 +27,11 @@ EXPIRY_S = 5.0
 """Time between two looks whether the session has ended [s]."""
 DIGITS = {"deg": 1, "rad": 3, "counts": 0}
 """Digits after the point, by unit; small differences have one more."""
-DEGREES = re.compile(r"(?P<place>stuck at )?(?P<value>[+-]?\d+(?:\.\d+)?) deg\b")
-"""An angle in a text: where a motor stands, or a difference or speed."""
+NUMBER = re.compile(r"(\+- )?([+-]?\d+(?:\.\d+)?)")
+DEGREES = re.compile(
+    rf"(?P<place>stuck at )?(?P<values>{NUMBER.pattern}(?: (?:to )?{NUMBER.pattern})*) deg\b"
+)
+"""Angles in a text: where a motor stands, or differences or speeds, with deviations or ranges."""
 CHOICES = {"theme": texts.THEMES, "unit": texts.UNIT_NAMES}
 YEAR_S = 31_536_000
 COLOURS = {
@@ -185,10 +189,16 @@ class Visit:
         if robot is None or self.unit == "deg":
             return text
 
+        unit = self.unit_of(robot)
+
+        def number(relative: bool, found: re.Match[str]) -> str:
+            value, _ = self._shown(float(np.deg2rad(float(found[2]))), robot, relative)
+            value = abs(value) if found[1] else value
+            return f"{found[1] or ''}{value:.{DIGITS[unit]}f}"
+
         def told(found: re.Match[str]) -> str:
-            angle = float(np.deg2rad(float(found["value"])))
-            value, unit = self._shown(angle, robot, relative=not found["place"])
-            return f"{found['place'] or ''}{value:.{DIGITS[unit]}f} {unit}"
+            place = found["place"] or ""
+            return f"{place}{NUMBER.sub(partial(number, not place), found['values'])} {unit}"
 
         return DEGREES.sub(told, text)
 

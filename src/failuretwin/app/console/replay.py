@@ -73,7 +73,7 @@ class Replay:
 
     def _button(self, reason: str, at: float) -> None:
         button = draw.button(reason, lambda: self._go_to(at))
-        button.props("flat").classes("reason")
+        button.props("flat align=left").classes("reason")
 
     def _go_to(self, at: float) -> None:
         self._slider.go_to(at)
