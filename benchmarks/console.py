@@ -1,11 +1,13 @@
 """Figures of the console in a headless Chromium: first paint, a wall of 1,000 robots, latency.
 
     python benchmarks/console.py [--seconds 30]
+    python benchmarks/console.py --minutes 20       # memory alone, at ten times the rate
 
 A server in a process of its own shows 1,000 robots whose time changes every second, and the arms of
 the demo. Needs Debian's chromium and chromium-driver. First paint is the largest of five loads;
 frames are counted by the browser; the processor share is that of the server. Latency is the age of
-the reading that the robot page shows, seen from the page 50 times a second.
+the reading that the robot page shows, seen from the page 50 times a second. Memory is that of the
+server and of all processes of the browser, each minute, with a robot page and the wall open.
 """
 
 from __future__ import annotations
@@ -39,8 +41,8 @@ AGES = """const done = arguments[0], ages = []; const timer = setInterval(() => 
   if (ages.length >= 500) { clearInterval(timer); done(ages); } }, 20);"""
 
 
-def serve(port: int) -> None:
-    """Show many robots and the demo."""
+def serve(port: int, speed: float) -> None:
+    """Show many robots and the demo, whose time passes so fast."""
     from failuretwin.app.console.demo import demo_arms
     from failuretwin.app.console.desk import Desk
     from failuretwin.app.console.server import Listening
@@ -54,14 +56,21 @@ def serve(port: int) -> None:
         def tiles(self) -> list[Tile]:
             now = datetime.now(UTC)
             many = [
-                Tile(f"hall_{k % 9}-arm_{k}", "armpi_fpv", WORST_FIRST[k % 6], "", "said", now)
+                Tile(
+                    f"hall_{k % 9}-arm_{k}",
+                    "armpi_fpv",
+                    WORST_FIRST[k % len(WORST_FIRST)],
+                    "",
+                    "said",
+                    now,
+                )
                 for k in range(ROBOTS)
             ]
             return [*super().tiles(), *many]
 
     known = load_calibration(None, "armpi_fpv")
     folder = Path(tempfile.mkdtemp())
-    desk = Many(known, None, None, demo_arms(known, 1.0), False, 1.0, folder)
+    desk = Many(known, None, None, demo_arms(known, speed), False, speed, folder)
     serve_console(desk, Listening("127.0.0.1", port, Sessions({})))
 
 
@@ -78,8 +87,31 @@ def share_of(process: int, seconds: float) -> float:
 
 
 def memory_of(process: int) -> float:
-    """Return the memory of a process [bytes]."""
-    return float(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    """Return the memory of a process [bytes]; what it shares counts in part."""
+    lines = Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()
+    return 1024.0 * sum(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+
+
+def memory_with_children(process: int) -> float:
+    """Return the memory of a process and all that it has started [bytes]."""
+    tasks = Path(f"/proc/{process}/task").glob("*/children")
+    children = {int(child) for one in tasks for child in one.read_text().split()}
+    return memory_of(process) + sum(memory_with_children(child) for child in children)
+
+
+def watch_memory(browser: Any, url: str, server: int, minutes: int) -> None:
+    """Print the memory each minute, with a robot page and the wall open."""
+    browser.get(url + "/robot?name=hall_1-arm_1")
+    browser.switch_to.new_window("window")
+    browser.get(url + "/")
+    for minute in range(minutes + 1):
+        shown = memory_with_children(browser.service.process.pid)
+        print(
+            f"{minute:3d} min: server {memory_of(server) / 1e6:.0f} MB, "
+            f"browser {shown / 1e6:.0f} MB, processor {share_of(server, 10.0):.0%} of a core",
+            flush=True,
+        )
+        time.sleep(50.0)
 
 
 def measure(browser: Any, url: str, process: int, seconds: float) -> None:
@@ -108,27 +140,28 @@ def measure(browser: Any, url: str, process: int, seconds: float) -> None:
         f"{1e3 * ages[int(0.95 * len(ages))]:.0f} ms (95 %)"
     )
     print(f"robot page open: server {share_of(process, seconds):.0%} of a core")
-    before = memory_of(process)
-    time.sleep(seconds)
-    grown = (memory_of(process) - before) / seconds * 3600.0
-    print(f"memory: {before / 1e6:.0f} MB, growing by {grown / 1e6:.0f} MB an hour")
 
 
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--minutes", type=int, default=0)
+    parser.add_argument("--speed", type=float, default=10.0)
     parser.add_argument("--serve", type=int)
     told = parser.parse_args()
+    speed = told.speed if told.minutes else 1.0
     if told.serve:
-        serve(told.serve)
+        serve(told.serve, told.speed)
         return
     from selenium import webdriver
 
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         port = one.getsockname()[1]
-    server = subprocess.Popen([sys.executable, __file__, "--serve", str(port)])
+    server = subprocess.Popen(
+        [sys.executable, __file__, "--serve", str(port), "--speed", str(speed)]
+    )
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which("chromium") or ""
     for flag in FLAGS:
@@ -139,7 +172,10 @@ def main() -> None:
         while socket.socket().connect_ex(("127.0.0.1", port)):
             time.sleep(0.5)
         url = f"http://127.0.0.1:{port}"
-        measure(browser, url, server.pid, told.seconds)
+        if told.minutes:
+            watch_memory(browser, url, server.pid, told.minutes)
+        else:
+            measure(browser, url, server.pid, told.seconds)
     finally:
         browser.quit()
         server.terminate()

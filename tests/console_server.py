@@ -25,23 +25,36 @@ PASSWORD = "correct horse"
 USERS = {"ada": "move", "eve": "see"}
 
 
-class ConsoleServer:
-    """A console with a demo, whose users sign in."""
+DEMO = ("--demo", "--demo-robots", "0", "--speed", "2")
 
-    def __init__(self, folder):
+
+class ConsoleServer:
+    """A console whose users sign in.
+
+    Args:
+        folder: Folder for its users.
+        options: What it shows.
+        environment: Variables it has besides ours.
+    """
+
+    def __init__(self, folder, options=DEMO, environment=None):
         pytest.importorskip("nicegui", reason="pip install 'failuretwin[console]'")
         self.port, self.process, self._folder = free_port(), None, folder
+        self._options, self._environment = options, environment or {}
         self.url = f"http://127.0.0.1:{self.port}"
         for name, role in USERS.items():
             add_user(folder / "users.toml", name, role, PASSWORD)
         self.start()
 
     def start(self):
-        options = ["--demo", "--demo-robots", "0", "--speed", "2", "--port", str(self.port)]
+        options = [*self._options, "--port", str(self.port)]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "failuretwin", "console", *options, "--users", "users.toml"],
             cwd=self._folder,
-            env={k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"},
+            env={
+                **{k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"},
+                **self._environment,
+            },
         )
         try:
             wait_for(self._listens)

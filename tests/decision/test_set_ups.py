@@ -19,9 +19,10 @@ from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp
-from failuretwin.inference.set_up_weighing import ANOTHER, right_in_some
+from failuretwin.inference.set_up_weighing import right_in_some
 from failuretwin.inference.set_ups.log_correction import CorrectionTable, LogCorrection
 from failuretwin.inference.set_ups.set_ups import FAULT_OF_EVERY_RUN, SetUp, mistakes, zero_off
+from failuretwin.inference.set_ups.wrong_setup import ANOTHER
 
 TRUTHS = ["healthy", "motor_2:stuck", "motor_3:steady_state_error"]
 NONE = LogCorrection.none(4)

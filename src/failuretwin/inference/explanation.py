@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,7 +31,7 @@ from failuretwin.inference.advice import (
     next_steps,
     rests_on_one_movement,
 )
-from failuretwin.inference.set_ups.wrong_setup import NOWHERE
+from failuretwin.inference.set_ups.wrong_setup import DOUBTS, NOWHERE
 
 TELLING_NATS = 1.0
 """Evidence of a movement worth telling [nats]: it changes the odds by a factor of 2.7."""
@@ -227,6 +227,11 @@ def undecided_step(reason: str) -> str:
     if NOWHERE in reason:
         return WRONG_SETUP_ADVICE
     return "Log again, for five movements or more, with the tool in view while it rests."
+
+
+def set_up_doubt(lines: Iterable[str]) -> str:
+    """Return the first remark on a log that says that its set-up is uncertain; empty: none."""
+    return next((line for line in lines if any(doubt in line for doubt in DOUBTS)), "")
 
 
 def _evidence_lines(

@@ -36,7 +36,7 @@ from failuretwin.inference.observation.rounding import (
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.robot_mixture import RobotComponent, RobotMixture, robot_components
 from failuretwin.inference.set_up_posterior import SetUpPosterior
-from failuretwin.inference.set_up_weighing import ANOTHER, SetUpWeighing
+from failuretwin.inference.set_up_weighing import SetUpWeighing
 from failuretwin.inference.set_ups.clock import clock_posterior
 from failuretwin.inference.set_ups.log_correction import LogCorrection
 from failuretwin.inference.set_ups.set_ups import (
@@ -47,6 +47,7 @@ from failuretwin.inference.set_ups.set_ups import (
     shifted,
     turned,
 )
+from failuretwin.inference.set_ups.wrong_setup import ANOTHER, MAY_MISFIT, MISFITS
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -323,7 +324,7 @@ def set_up_remark(set_ups: SetUpPosterior) -> str:
     pairs = zip(set_ups.found, set_ups.probability, strict=True)
     named = [(one.set_up, float(share)) for one, share in pairs if one.set_up.what]
     if not set_ups.fits:
-        return f"the log does not fit the profile: {ANOTHER}"
+        return f"{MISFITS}: {ANOTHER}"
     kept, total = [], 0.0
     for set_up, share in named:
         kept.append(set_up.told)
@@ -332,12 +333,12 @@ def set_up_remark(set_ups: SetUpPosterior) -> str:
             break
     ways = "; or ".join(kept)
     if set_ups.wrong < SURE:
-        return f"the log may not fit the profile ({set_ups.wrong:.0%}): {ways}"
+        return f"{MAY_MISFIT} ({set_ups.wrong:.0%}): {ways}"
     sure = "over 99.9 %" if set_ups.wrong > 0.999 else f"{100.0 * set_ups.wrong:.1f} %"
-    return f"the log does not fit the profile ({sure} sure): {ways}"
+    return f"{MISFITS} ({sure} sure): {ways}"
 
 
 def set_up_finding(set_ups: SetUpPosterior) -> str:
     """Return the same, also where neither a fault nor a mistake explains the runs."""
-    unexplained = "" if set_ups.fits else f"the log does not fit the profile: {ANOTHER}"
+    unexplained = "" if set_ups.fits else f"{MISFITS}: {ANOTHER}"
     return set_up_remark(set_ups) or unexplained

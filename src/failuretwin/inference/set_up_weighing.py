@@ -64,8 +64,6 @@ ROUNDS = 2
 """Newton steps to the zero that explains the runs best."""
 CHUNK_RUNS = 64
 """Runs that are weighed at a time, whatever the set-up."""
-ANOTHER = "no fault explains it, and the set-up is not wrong in one way that is known"
-"""What is said where no set-up explains the runs."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import time
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -7,22 +8,25 @@ import pytest
 
 pytest.importorskip("nicegui")
 
-from failuretwin.app.console import act, state, users
+from failuretwin.app.console import act, live, state, texts, users
 from failuretwin.app.console.checking import HANGS_S, Stoppable, beat_watch
+from failuretwin.app.console.layout import Visit
+from failuretwin.app.console.live import LiveRobot, LiveSettings
 from failuretwin.connection.links.base import Order, Reading
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.records.overview import RobotGlance
 from failuretwin.data_knowledge.records.store import open_store
 from failuretwin.decision.acting.work import Halted
+from failuretwin.digital_model.calibrated_robot import calibrated
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
 
 
-def glance(days=1.0, verdict_state="healthy", faults=None):
+def glance(days=1.0, verdict_state="healthy", faults=None, remarks=()):
     at = None if days is None else NOW - timedelta(days=days)
-    return RobotGlance("hall-arm", "armpi_fpv", at, verdict_state, "said", faults or {})
+    return RobotGlance("hall-arm", "armpi_fpv", at, verdict_state, "said", faults or {}, remarks)
 
 
 @pytest.mark.parametrize(
@@ -39,6 +43,32 @@ def glance(days=1.0, verdict_state="healthy", faults=None):
 def test_the_state_of_a_stored_robot(one, expected):
     tile = state.stored_tile(one, NOW)
     assert (tile.state, tile.site) == (expected, "hall")
+
+
+DOUBT = "the log does not fit the profile (97.0 % sure): the sense of motor 2 is wrong"
+
+
+@pytest.mark.parametrize(
+    ("given", "states"),
+    [
+        ({}, (state.SET_UP,)),
+        ({"verdict_state": "cannot tell"}, (state.SET_UP,)),
+        ({"faults": {"motor_3:stuck": True}}, (state.ALARM, state.SET_UP)),
+        ({"days": 31.0}, (state.STALE, state.SET_UP)),
+    ],
+)
+def test_a_robot_whose_set_up_is_uncertain_is_shown_so(given, states):
+    tile = state.stored_tile(glance(**given, remarks=("", "readings glitch", DOUBT)), NOW)
+    assert (tile.states, tile.set_up) == (states, DOUBT)
+    assert DOUBT in tile.said
+    assert tile.record()["states"] == states
+
+
+def test_an_arm_whose_fleet_doubts_its_set_up_is_shown_so():
+    robot = {"state": "undecided", "cause": DOUBT, "heard": 100.0}
+    status = {"partitions": {"p1": {"at": 100.0, "robots": {"a": robot}}}}
+    (tile,) = state.fleet_tiles(status, {}, 101.0)
+    assert (tile.states, tile.said) == ((state.SET_UP,), DOUBT)
 
 
 def test_the_worst_robot_comes_first():
@@ -150,9 +180,62 @@ def test_a_stopped_arm_is_told_to_stay_where_it_was_read():
 
 
 def test_a_check_stops_by_itself_if_the_console_hangs_or_its_page_is_gone():
-    import time
-
     now = time.monotonic()
-    assert beat_watch(lambda: now, lambda: True)() == ""
-    assert "hangs" in beat_watch(lambda: now - HANGS_S - 1.0, lambda: True)()
-    assert "gone" in beat_watch(lambda: now, lambda: False)()
+    late = now - HANGS_S - 1.0
+    assert beat_watch(lambda: now, lambda: now)() == ""
+    assert beat_watch(lambda: late, lambda: now)() == texts.HANG
+    assert beat_watch(lambda: now, lambda: late)() == texts.GONE
+
+
+class Unheard:
+    """A diagnoser of a robot that nobody is heard of."""
+
+    set_up = None
+
+
+def watched(robot, open_source):
+    known = calibrated(robot)
+    return LiveRobot(LiveSettings("arm", known, Unheard(), open_source))
+
+
+def test_a_robot_whose_watch_fails_or_hangs_is_stale(armpi):
+    def broken(stack):
+        raise ZeroDivisionError("broken")
+
+    failed, hung = watched(armpi, broken), watched(armpi, broken)
+    assert hung.tile.state == state.WAITING
+    with pytest.raises(ZeroDivisionError):
+        failed._run()
+    assert failed.tile.state == state.STALE
+    assert failed.tile.said.startswith("the watch has failed: ZeroDivisionError: broken; last word")
+    hung._seen_s = time.monotonic() - live.HANGS_S - 1.0
+    assert (hung.tile.state, hung.tile.said) == (state.STALE, "last word: nothing was heard yet")
+
+
+@pytest.mark.parametrize(
+    ("unit", "text", "said"),
+    [
+        ("deg", "motor 3 stuck at 26 deg since 0.5 s", "motor 3 stuck at 26 deg since 0.5 s"),
+        ("rad", "motor 3 stuck at 26 deg since 0.5 s", "motor 3 stuck at 0.454 rad since 0.5 s"),
+        (
+            "counts",
+            "motor 3 stuck at 26 deg since 0.5 s",
+            "motor 3 stuck at 392 counts since 0.5 s",
+        ),
+        ("rad", "motor 2 drifts by 9.0 deg/s", "motor 2 drifts by 0.157 rad/s"),
+        ("counts", "misses by about 2.4 deg", "misses by about -10 counts"),
+        ("rad", "+1.80 +- 0.90 deg", "0.031 +- 0.016 rad"),
+        ("counts", "-1.80 +- 0.90 deg", "8 +- 4 counts"),
+        ("rad", "from 90 to 180 deg", "from 1.571 to 3.142 rad"),
+    ],
+)
+def test_angles_in_texts_are_in_the_unit_of_the_reader(armpi, unit, text, said):
+    visit = Visit(None, None, "auto", unit, None)
+    assert visit.words(text, armpi) == said
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad", "counts"])
+def test_an_angle_that_is_typed_is_meant_as_it_is_shown(armpi, unit):
+    visit = Visit(None, None, "auto", unit, None)
+    told = float(visit.angle(0.3, armpi, 2).split()[0])
+    assert visit.held(told, armpi, 2) == pytest.approx(0.3, abs=0.005)

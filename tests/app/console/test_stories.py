@@ -6,12 +6,9 @@ The stories are told in their order, on one server and in one browser.
 from __future__ import annotations
 
 import json
-import os
 import time
 import urllib.parse
 import urllib.request
-from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
@@ -19,81 +16,9 @@ import failuretwin as ft
 from console_server import PASSWORD
 
 pytest.importorskip("selenium", reason="selenium is not installed")
-from selenium.common.exceptions import WebDriverException
-from selenium.webdriver.common.keys import Keys
+from console_person import Person
 
-SICK, LIVE, SILENT = "hall_2-arm_7", "hall_1-arm_2", "hall_1-arm_3"
-PICTURES = os.environ.get("FAILURETWIN_PICTURES")
-"""Folder for the pictures of README and docs; empty: none are taken."""
-LONGEST_S = 180.0
-
-
-class Person:
-    """Somebody at the browser."""
-
-    def __init__(self, browser, url):
-        self.browser, self.url = browser, url
-
-    def go(self, page):
-        self.browser.get(self.url + page)
-
-    def find(self, xpath):
-        """Return what is found, once it is there."""
-        deadline = time.monotonic() + LONGEST_S
-        while not (found := self.browser.find_elements("xpath", xpath)):
-            assert time.monotonic() < deadline, f"{xpath} is not there: {self.text[:2000]}"
-            time.sleep(0.1)
-        return found[0]
-
-    def click(self, words):
-        """Click a link or button with some words."""
-        said = f"[normalize-space()='{words}' or @aria-label='{words}']"
-        self.press(f"//a{said}|//button{said}")
-
-    def press(self, xpath):
-        """Click what is found; where it is drawn anew meanwhile, click the new one."""
-
-        def clicked():
-            target = self.find(xpath)
-            self.browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", target)
-            target.click()
-            return True
-
-        self.waits(clicked)
-
-    def write(self, label, words):
-        field = self.find(f"//input[@aria-label='{label}' or @name='{label}']")
-        field.send_keys(Keys.CONTROL + "a")
-        field.send_keys(words)
-
-    @property
-    def text(self):
-        return self.browser.find_element("tag name", "body").text
-
-    def sees(self, *words):
-        """Wait until words are there."""
-        self.waits(lambda: all(one in self.text for one in words), words)
-
-    def waits(self, truth, words=""):
-        """Wait until something holds; a page may be drawn anew meanwhile."""
-        deadline = time.monotonic() + LONGEST_S
-        while True:
-            with suppress(WebDriverException):
-                if truth():
-                    return
-            assert time.monotonic() < deadline, f"{words} in vain: {self.text[:2000]}"
-            time.sleep(0.1)
-
-    def sign_in(self, name, password):
-        self.go("/login")
-        self.write("name", name)
-        self.write("password", password)
-        self.click("Sign in")
-
-    def picture(self, name):
-        if PICTURES:
-            time.sleep(1.0)
-            self.browser.save_screenshot(str(Path(PICTURES) / f"{name}.png"))
+SICK, LIVE, SILENT, DOUBTED = "hall_2-arm_7", "hall_1-arm_2", "hall_1-arm_3", "hall_2-arm_8"
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +51,15 @@ def test_the_wall_is_searched_and_filtered(person):
     person.write("search", "arm_7")
     person.sees("1 of ")
     person.write("search", "nobody")
+    person.sees("No robot matches.")
+    person.go("/")
+    person.sees(DOUBTED)
+    person.find("//select[@name='states']/option[contains(., 'set-up uncertain')]").click()
+    person.sees("1 of ", DOUBTED, "motor 2 turns the other way")
+    for key, value in (("kind", "armpi_fpv"), ("site", "hall_2")):
+        person.find(f"//select[@name='{key}']/option[contains(., '{value}')]").click()
+        person.sees("1 of ", DOUBTED)
+    person.find("//select[@name='site']/option[contains(., 'hall_1')]").click()
     person.sees("No robot matches.")
     person.go("/")
 

@@ -98,12 +98,13 @@ def console(
         if source is not None:
             name = memory.robot_name or known.robot.name
             arms[name] = _live(name, source, known, live, budget, robot.seed, stored)
+        from failuretwin.app.console.demo import LOGS
         from failuretwin.app.console.desk import Desk
         from failuretwin.app.console.server import Listening, serve
 
         reached = access.to(url) if url is not None else None
         speed = live.speed or 1.0
-        expected = demo_robots + 1 if demo else 0
+        expected = len(LOGS) + demo_robots + bool(demo_robots) if demo else 0
         desk = Desk(known, store, reached, arms, move, speed, folder, expected=expected)
         serve(desk, Listening(host, port, sessions))
 
@@ -125,8 +126,9 @@ def _begin_demo(
     store = demo.demo_store(folder, known)
     arms |= demo.demo_arms(known, speed)
     if robots:
-        writer = demo.write_history(store, robots, 1.0)
-        stack.callback(writer.terminate)
+        writer = demo.HistoryWriter(store, folder, known, robots)
+        stack.callback(writer.stop)
+        writer.start()
     return store
 
 
@@ -158,6 +160,7 @@ def _live(
         load_topics(live.topics).wait_s,
         tuple(fault.partition("@")[0] for fault in live.faults),
         source if is_network(source) else "",
+        live.topics,
     )
     if stored is None:
         return LiveRobot(settings)

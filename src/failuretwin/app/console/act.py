@@ -7,6 +7,7 @@ import tempfile
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from html import escape
 from pathlib import Path
 
@@ -22,15 +23,19 @@ from failuretwin.app.reports.check_report import check_lines, closing_lines
 from failuretwin.app.terminal import Table
 from failuretwin.connection.links.base import Commander
 from failuretwin.connection.links.replay import Pace
+from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.foreign import printable
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.robot_state import robot_state
 from failuretwin.decision.test_motions.health_check import Checking, CheckResult
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+from failuretwin.inference.diagnoser import BayesDiagnoser
 
 LINES_S = 0.5
 """Time between two updates of a check [s]."""
 LONGEST_CHECK_S = 120.0
+BEAT = "<script>setInterval(() => window.socket?.connected && emitEvent('beat'), 1000)</script>"
+"""Signs of a page that it works: its arm is stopped if they stay away."""
 SUFFIXES = (".nc", ".csv", ".mat", ".bag", ".mcap", ".db3", ".parquet")
 """Files that are taken."""
 LABELS = f"""for (const one of document.querySelectorAll(".q-uploader__input, .q-uploader a"))
@@ -80,6 +85,13 @@ class CheckPage:
         self._lines = ui.element("div").props('role="log" aria-live="polite"')
         self._shown: list[object] = []
         ui.timer(LINES_S, self._update)
+        self._beat_s = time.monotonic()
+        ui.on("beat", self._beat)
+        ui.add_body_html(BEAT)
+
+    def _beat(self) -> None:
+        """Note that the page works."""
+        self._beat_s = time.monotonic()
 
     def _start(self) -> None:
         desk, known, name = self._visit.desk, self._known, self._name
@@ -88,12 +100,12 @@ class CheckPage:
         if desk.check is not None and desk.check.running:
             ui.notify(texts.BUSY, type="negative")
             return
-        client = ui.context.client
+        self._beat()
         desk.check = CheckRun(
             name or known.robot.name,
             Checking(known, SafetyGate(known.robot)),
             lambda stack: _arm(desk, known, name, self._real, stack),
-            beat_watch(lambda: desk.beat_s, lambda: client.has_socket_connection),
+            beat_watch(lambda: desk.beat_s, lambda: self._beat_s),
             lambda result: _keep(desk, known, name, result),
         )
         seconds = float(self._seconds.value or 20.0)
@@ -108,9 +120,9 @@ class CheckPage:
         self._lines.clear()
         with self._lines:
             for line in check.lines:
-                draw.text(line)
+                draw.text(self._visit.words(line, self._known.robot))
             if check.result is not None:
-                _result(check.result, self._known)
+                _result(check.result, self._known, self._visit)
 
 
 def _arm(desk: Desk, known: CalibratedRobot, name: str, real: bool, stack: ExitStack) -> Commander:
@@ -121,7 +133,9 @@ def _arm(desk: Desk, known: CalibratedRobot, name: str, real: bool, stack: ExitS
 
     live = desk.live.get(name)
     if real and live is not None:
-        return commander_of(ArmOptions(live.settings.place, (), True, None), known, 0, stack)
+        return commander_of(
+            ArmOptions(live.settings.place, (), True, live.settings.topics), known, 0, stack
+        )
     faults = live.settings.faults if live is not None else ()
     emulation = emulation_with(faults, known_arm(known.robot), int(time.time()))
     return stack.enter_context(EmulatedArm(emulation, Pace(desk.speed)))
@@ -135,12 +149,13 @@ def _keep(desk: Desk, known: CalibratedRobot, name: str, result: CheckResult) ->
         desk.look()
 
 
-def _result(result: CheckResult, known: CalibratedRobot) -> None:
+def _result(result: CheckResult, known: CalibratedRobot, visit: Visit) -> None:
+    words = partial(visit.words, robot=known.robot)
     for part in [*check_lines(result, known.robot, 0.0), *closing_lines(result, known.robot)]:
         if isinstance(part, Table):
-            draw.table(part.headings, part.rows)
+            draw.table(part.headings, [[words(cell) for cell in row] for row in part.rows])
         else:
-            draw.text(part)
+            draw.text(words(part))
 
 
 # Logs.
@@ -218,10 +233,14 @@ async def _show_imported(visit: Visit, found: Imported, kind: str) -> None:
     known = visit.desk.of_kind(kind)
     if known is None:
         return
-    state = robot_state(found.diagnoses, known.robot)
-    draw.heading(state.headline)
-    draw.text(state.step)
-    draw.table((texts.RUN, texts.VERDICT), [[one.run, one.verdict] for one in found.diagnoses])
+    state, words = (
+        robot_state(found.diagnoses, known.robot),
+        partial(visit.words, robot=known.robot),
+    )
+    draw.heading(words(state.headline))
+    draw.text(words(state.step))
+    rows = [[one.run, words(one.verdict)] for one in found.diagnoses]
+    draw.table((texts.RUN, texts.VERDICT), rows)
     for line in found.stored or [texts.NOT_STORED]:
         draw.text(line)
     number = await draw.worked(_report, visit.desk, found, known)
@@ -241,6 +260,16 @@ def _report(desk: Desk, found: Imported, known: CalibratedRobot) -> int:
     for old in sorted(desk.reports)[:-REPORTS]:
         del desk.reports[old]
     return number
+
+
+def run_report(desk: Desk, name: str, row: int) -> str:
+    """Return the page for technicians on a run of a robot in the store."""
+    try:
+        runs, known = desk.stored_log(name, row)
+    except FailureTwinError as error:
+        return f"<p>{escape(printable(str(error)))}</p>"
+    diagnoses = BayesDiagnoser(known.twin, known.imperfections).diagnose(runs)
+    return report_page(desk, _report(desk, Imported(runs, diagnoses, ()), known))
 
 
 def report_page(desk: Desk, number: int) -> str:

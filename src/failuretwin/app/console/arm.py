@@ -6,13 +6,14 @@ It is drawn in the pose that the tool path belongs to, `Robot.sensor_sense`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from math import cos, sin
 
 import numpy as np
 from nicegui import ui
 from nicegui.elements.scene.scene_object3d import Object3D
 
-from failuretwin.app.console import draw
+from failuretwin.app.console import draw, texts
 from failuretwin.app.console.state import SUSPECT
 from failuretwin.core.hypothesis import SURE
 from failuretwin.core.types import BoolArray, FloatArray
@@ -23,8 +24,15 @@ THICK = 0.03
 GHOST, LINK = "#2f7fd0", "#7d8790"
 SHADES = ((SURE, "#b3261e"), (SUSPECT, "#d98e00"), (0.0, "#1b6e3c"))
 """Colour of a motor from a probability of a fault on."""
-CAMERA = (0.65, -0.65, 1.1)
-"""Place of the camera, in reaches of the arm: high, so that arms that fold show it."""
+VIEWS = {
+    texts.CORNER: (0.65, -0.65, 1.1),
+    texts.FRONT: (0.0, -1.3, 0.4),
+    texts.SIDE: (1.3, 0.0, 0.4),
+    texts.ABOVE: (0.0, -0.01, 1.7),
+}
+"""Places of the camera, in reaches of the arm; the first is high: it shows arms that fold."""
+TURN_S = 0.5
+"""Time in which the camera goes to another place [s]."""
 REACHED, MISSED = [0.11, 0.43, 0.24], [0.7, 0.15, 0.12]
 
 
@@ -121,6 +129,10 @@ class ArmScene:
     def __init__(self, robot: Robot, label: str) -> None:
         self._robot, self._label = robot, label
         self._place = ui.element("div").classes("scene")
+        self._scene: ui.scene | None = None
+        with ui.row().classes("gap-2").props(f'role="group" aria-label="{texts.VIEW}"'):
+            for name, place in VIEWS.items():
+                draw.button(name, partial(self._view, place, TURN_S)).props("outline")
         self._arms: tuple[Arm, Arm] | None = None
         self._now: tuple[FloatArray, FloatArray, Mapping[str, float]] | None = None
         self._cloud: tuple[list[list[float]], list[list[float]]] = [], []
@@ -134,10 +146,17 @@ class ArmScene:
         self._arms = Arm(self._robot, scene, solid=True), Arm(self._robot, scene, solid=False)
         with scene:
             self._points = ui.scene.point_cloud(*self._cloud, point_size=0.012 * reach / 0.3)
-        x, y, z = (reach * one for one in CAMERA)
-        scene.move_camera(x, y, z, 0.0, 0.0, 0.4 * reach, duration=0.0)
+        self._scene = scene
+        self._view(VIEWS[texts.CORNER], 0.0)
         if self._now is not None:
             self.show(*self._now)
+
+    def _view(self, place: tuple[float, float, float], duration_s: float) -> None:
+        """Look at the arm from a place [reaches of the arm]."""
+        x, y, z = (self._robot.reach * one for one in place)
+        if self._scene is not None:
+            height = 0.4 * self._robot.reach
+            self._scene.move_camera(x, y, z, 0.0, 0.0, height, duration=duration_s)
 
     def show(self, pose: FloatArray, command: FloatArray, shares: Mapping[str, float]) -> None:
         """Draw both arms: poses in the sense of the log, (motor,) [rad or m]."""

@@ -19,7 +19,7 @@ from failuretwin.decision.acting.work import Halted
 from failuretwin.decision.test_motions.health_check import Checking, CheckResult
 
 HANGS_S = 5.0
-"""A console that does not beat for so long hangs, and the arm is stopped [s]."""
+"""A server or page that does not beat for so long hangs, and the arm is stopped [s]."""
 HOLD_S = 0.1
 """Duration of the order to stay [s]."""
 
@@ -141,14 +141,16 @@ class CheckRun:
             self._over.set()
 
 
-def beat_watch(
-    beat_s: Callable[[], float], begun_by_is_there: Callable[[], bool]
-) -> Callable[[], str]:
-    """Return what tells why a check must stop by itself: the console hangs, or its page is gone."""
+def beat_watch(server_s: Callable[[], float], page_s: Callable[[], float]) -> Callable[[], str]:
+    """Return what tells why a check must stop by itself: the server hangs, or the page does.
+
+    Both are given by the time of their last beat, by the monotonic clock [s].
+    """
 
     def why() -> str:
-        if time.monotonic() - beat_s() > HANGS_S:
+        late_s = time.monotonic() - HANGS_S
+        if server_s() < late_s:
             return texts.HANG
-        return "" if begun_by_is_there() else texts.GONE
+        return texts.GONE if page_s() < late_s else ""
 
     return why

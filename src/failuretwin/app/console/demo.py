@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -33,15 +34,19 @@ ARMS = {
     "hall_1-arm_3": ((), 30.0),
 }
 """Emulated arms: their faults, and when each falls silent [s]; 0: never."""
-LOGS = (("monday", 0), ("tuesday", 2), ("wednesday", 3))
-"""Logs of a robot with a stuck motor: name and number of the simulated run."""
+LOGS = {
+    "hall_2-arm_7": (("monday", 0), ("tuesday", 2), ("wednesday", 3)),
+    "hall_2-arm_8": (("thursday", 1),),
+}
+"""Logs of robots: name and number of the simulated run. The last two are of a stuck motor."""
+TRACKED, TRACKED_RUNS, TRACKED_SEED = "hall_2-arm_9", 24, 3
+"""Robot whose offsets are followed over two logs, for its remaining life; its runs."""
+REVERSED = {"hall_2-arm_8": 1}
+"""Robots whose set-up is wrong: the number of the motor whose commands have the other sign."""
 
 
 def demo_store(folder: Path, known: CalibratedRobot) -> Store:
-    """Return a store that a thread fills with a robot whose logs are in the folder.
-
-    Its motor 3 is stuck since the second log.
-    """
+    """Return a store that a thread fills with robots whose logs are in the folder."""
     store = open_store(folder / "robots.db", create=True)
     Thread(target=_write_logs, args=(store, folder, known), name="logs", daemon=True).start()
     return store
@@ -52,29 +57,80 @@ def _write_logs(store: Store, folder: Path, known: CalibratedRobot) -> None:
         known.robot, ["healthy", "motor_3:stuck"], 2, seed=7, imperfections=known.imperfections
     )
     runs, midnight = simulate(plan), last_midnight().timestamp()
-    record = RobotRecord(store, "hall_2-arm_7", known.robot)
     diagnoser = BayesDiagnoser(known.twin, known.imperfections)
-    for day, (name, number) in enumerate(LOGS):
-        path, at = folder / f"{name}.nc", midnight - (len(LOGS) - day) * DAY_S
-        one = runs.isel(run=[number]).assign_coords(run=[name]).drop_vars(_TRUTH, errors="ignore")
-        one.to_netcdf(path)
-        os.utime(path, (at, at))
-        record.remember(diagnoser.diagnose(one), log_file(path))
+    for robot, logs in LOGS.items():
+        record = RobotRecord(store, robot, known.robot)
+        motors = np.arange(len(known.robot.motors))
+        signs = np.where(motors == REVERSED.get(robot, -1), -1.0, 1.0)
+        for day, (name, number) in enumerate(logs):
+            path, at = folder / f"{name}.nc", midnight - (len(logs) - day) * DAY_S
+            one = runs.isel(run=[number]).assign_coords(run=[name])
+            one = one.drop_vars(_TRUTH, errors="ignore")
+            one = one.assign({part: signs * one[part] for part in _COMMANDED if part in one})
+            one.to_netcdf(path)
+            os.utime(path, (at, at))
+            record.remember(diagnoser.diagnose(one), log_file(path))
 
 
 _TRUTH = ["fault", "fault_detail", "onset", "magnitude"]
+_COMMANDED = ("command", "target")
 
 
-def write_history(store: Store, robots: int, years: float) -> subprocess.Popen[bytes]:
-    """Simulate years of a fleet into a store, robot by robot, in a process that is returned.
+@dataclass
+class HistoryWriter:
+    """Writes the past of the demo into its store, in processes that give way to the pages.
 
-    It gives way to the pages.
+    Attributes:
+        store: The store.
+        folder: Folder for logs.
+        known: The robot, calibrated.
+        robots: Robots whose year is simulated.
     """
-    fleet = ["--fleet", str(robots), "--years", str(years), "--seed", str(YEAR_SEED)]
-    command = [sys.executable, "-m", "failuretwin", "simulate", *fleet, "--store", store.name]
-    writer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    os.setpriority(os.PRIO_PROCESS, writer.pid, LOW_PRIORITY)
-    return writer
+
+    store: Store
+    folder: Path
+    known: CalibratedRobot
+    robots: int
+    _process: subprocess.Popen[bytes] | None = None
+    _stopped: bool = False
+
+    def start(self) -> None:
+        """Begin to write."""
+        Thread(target=self._write, name="history", daemon=True).start()
+
+    def stop(self) -> None:
+        """End the process that writes."""
+        self._stopped = True
+        if self._process is not None:
+            self._process.terminate()
+
+    def _write(self) -> None:
+        stored = ["--store", self.store.name]
+        for log in self._tracked_logs():
+            self._run("diagnose", str(log), "--track", "--robot-name", TRACKED, *stored)
+        fleet = ["--fleet", str(self.robots), "--years", "1", "--seed", str(YEAR_SEED)]
+        self._run("simulate", *fleet, *stored)
+
+    def _tracked_logs(self) -> list[Path]:
+        """Write the logs of the robot that is followed, and return them."""
+        healthy = self.known.imperfections
+        plan = Plan(self.known.robot, ["healthy"], TRACKED_RUNS, TRACKED_SEED, healthy)
+        runs, halves, paths = simulate(plan), np.split(np.arange(TRACKED_RUNS), 2), []
+        for name, half, days in zip(("may", "november"), halves, (200, 1), strict=True):
+            path, at = self.folder / f"{name}.nc", last_midnight().timestamp() - days * DAY_S
+            runs.isel(run=half).drop_vars(_TRUTH, errors="ignore").to_netcdf(path)
+            os.utime(path, (at, at))
+            paths.append(path)
+        return paths
+
+    def _run(self, *arguments: str) -> None:
+        """Run a command to its end, unless all is stopped."""
+        if self._stopped:
+            return
+        command, quiet = [sys.executable, "-m", "failuretwin", *arguments], subprocess.DEVNULL
+        self._process = subprocess.Popen(command, stdout=quiet, stderr=quiet)
+        os.setpriority(os.PRIO_PROCESS, self._process.pid, LOW_PRIORITY)
+        self._process.wait()
 
 
 def demo_arms(known: CalibratedRobot, speed: float) -> dict[str, LiveRobot]:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING
@@ -28,7 +29,7 @@ from failuretwin.data_knowledge.records.log_files import log_file
 from failuretwin.data_knowledge.records.overview import RobotGlance, StoredRun
 from failuretwin.data_knowledge.records.store import Store
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
-from failuretwin.digital_model.robot import bundled_robots, load_robot
+from failuretwin.digital_model.robot import Robot, bundled_robots, load_robot
 from failuretwin.inference.diagnoser import BayesDiagnoser
 
 if TYPE_CHECKING:
@@ -114,7 +115,7 @@ class Desk:
         kinds = {name: tile.kind for name, tile in found.items()}
         for tile in self._fleet:
             found[tile.name] = replace(tile, kind=kinds.get(tile.name, tile.kind))
-        found |= {name: robot.view.tile for name, robot in self.live.items()}
+        found |= {name: robot.tile for name, robot in self.live.items()}
         return shown.worst_first(list(found.values()))
 
     @property
@@ -167,14 +168,19 @@ class Desk:
         tile = self.tile(name)
         return None if tile is None else self.of_kind(tile.kind, name)
 
+    def profile(self, kind: str) -> Robot | None:
+        """Return the robot of a profile; None: it is not known here."""
+        if kind in ("", self.known.robot.name):
+            return self.known.robot
+        return _bundled(kind)
+
     def of_kind(self, kind: str, name: str = "") -> CalibratedRobot | None:
         """Return a robot of a profile, with the calibration of the store if it has one."""
-        if kind in ("", self.known.robot.name):
-            known = self.known
-        elif kind in bundled_robots():
-            known = load_calibration(None, load_robot(kind))
-        else:
+        profile = self.profile(kind)
+        if profile is None:
             return None
+        own = profile is self.known.robot
+        known = self.known if own else load_calibration(None, profile)
         record = self.record(name, known)
         return record.calibrated or known if record is not None else known
 
@@ -222,11 +228,19 @@ class Desk:
         Raises:
             InputError: If there is no such run, or its log is not here.
         """
+        return trace_of(*self.stored_log(name, row))
+
+    def stored_log(self, name: str, row: int) -> tuple[xr.Dataset, CalibratedRobot]:
+        """Return a run of a robot in the store as its log has it, and the robot.
+
+        Raises:
+            InputError: If there is no such run, or its log is not here.
+        """
         run = next((one for one in self.stored_runs(name) if one.row == row), None)
         known = self.robot(name)
         if run is None or known is None or not Path(run.log).exists():
             raise InputError(f"run {row} of {name!r}: its log is not on this computer.")
-        return trace_of(read_runs(run.log, known.robot).isel(run=[run.position]), known)
+        return read_runs(run.log, known.robot).isel(run=[run.position]), known
 
     # What is worked out when it is asked for.
 
@@ -261,6 +275,11 @@ class Desk:
             f"{motor}: {life.verdict}" if life else f"{motor}: fewer than {LEAST_RUNS} runs"
             for motor, life in lives.items()
         ]
+
+
+@cache
+def _bundled(kind: str) -> Robot | None:
+    return load_robot(kind) if kind in bundled_robots() else None
 
 
 def trace_of(runs: xr.Dataset, known: CalibratedRobot) -> Trace:

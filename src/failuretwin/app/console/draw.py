@@ -13,6 +13,8 @@ from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.foreign import printable
 
 T = TypeVar("T")
+EVENT_S = 0.05
+"""Least time between two movements of a slider that are told [s]."""
 
 
 def text(words: str, tag: str = "p") -> ui.label:
@@ -38,10 +40,12 @@ def heading(words: str, level: int = 2) -> ui.label:
     return text(words, f"h{level}")
 
 
-def badge(state: str) -> ui.label:
-    """Draw a state by word, sign and colour."""
-    words = f"{texts.SIGNS[state]} {texts.STATES[state]}"
-    return text(words, "span").classes(f"state state-{state}")
+def badges(states: Sequence[str]) -> None:
+    """Draw states by word, sign and colour."""
+    with ui.element("p").classes("flex gap-2"):
+        for state in states:
+            words = f"{texts.SIGNS[state]} {texts.STATES[state]}"
+            text(words, "span").classes(f"state state-{state}")
 
 
 class Choice:
@@ -74,6 +78,43 @@ class Choice:
         if isinstance(event.args, int) and 0 <= event.args < len(self._options):
             self.value = self._options[event.args]
             self._on_change()
+
+
+class Slider(ui.element, component="slider.js"):
+    """A slider: that of the browser, which arrow keys move.
+
+    Attributes:
+        value: Where it is.
+    """
+
+    def __init__(
+        self,
+        ends: tuple[float, float],
+        step: float,
+        value: float,
+        label: str,
+        on_change: Callable[[], object],
+    ) -> None:
+        super().__init__()
+        self.value, self._on_change, self._ends = value, on_change, ends
+        self._props |= {"low": ends[0], "high": ends[1], "step": step, "start": value}
+        self._props["label"] = label
+        self.classes("full-width")
+        self.on("moved", self._moved, throttle=EVENT_S)
+
+    def go_to(self, value: float) -> None:
+        """Move it."""
+        self._take(value)
+        self.run_method("show", self.value)
+
+    def _moved(self, event: events.GenericEventArguments) -> None:
+        if isinstance(event.args, int | float):
+            self._take(float(event.args))
+
+    def _take(self, value: float) -> None:
+        low, high = self._ends
+        self.value = min(max(value, low), high)
+        self._on_change()
 
 
 Cell = str | Callable[[], object]

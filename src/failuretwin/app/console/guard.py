@@ -48,7 +48,8 @@ FORM = """<!doctype html><html lang="en"><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>
 <style>:root{{color-scheme:light dark}}body{{font:1rem/1.5 system-ui,sans-serif;max-width:22rem;
 margin:10vh auto;padding:0 1rem}}label,input,button{{display:block;width:100%;font:inherit;
-box-sizing:border-box}}input,button{{padding:.5rem;margin:.2rem 0 1rem}}</style>
+box-sizing:border-box}}input,button{{padding:.5rem;margin:.2rem 0 1rem}}
+:focus-visible{{outline:3px solid #ffbf47;box-shadow:0 0 0 5px #16191c}}</style>
 <main><h1>{title}</h1>{body}</main></html>"""
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from datetime import UTC, datetime
 from functools import partial
 
 from nicegui import ui
@@ -56,7 +55,7 @@ class HistoryPage:
         history = self._store.history(self._name)
         self._body.clear()
         with self._body:
-            draw.text(history.health)
+            draw.text(history.health_by(self._visit.day))
             self._episodes(history)
             self._repair()
             self._rates(history.kind)
@@ -185,7 +184,12 @@ def _value(field: ui.input) -> str:
 
 def _timeline(visit: Visit, history: History) -> None:
     draw.heading(texts.TIMELINE)
-    rows = [[visit.time(one.at), one.kind, one.text] for one in reversed(history.timeline)]
+    known = visit.desk.robot(history.robot)
+    robot = None if known is None else known.robot
+    rows = [
+        [visit.time(one.at), one.kind, visit.words(one.text, robot)]
+        for one in reversed(history.timeline)
+    ]
     draw.table((texts.WHEN, texts.EVENT, texts.SAYS), rows)
 
 
@@ -196,7 +200,7 @@ def _compare(visit: Visit, history: History) -> None:
     if not history.drifts or known is None:
         draw.text(texts.NO_OFFSETS)
         return
-    days = sorted({f"{at:%Y-%m-%d}" for one in history.drifts for at in one.at})
+    days = sorted({visit.day(at) for one in history.drifts for at in one.at})
 
     def show_dates() -> None:
         place.clear()
@@ -221,16 +225,18 @@ def _at_dates(visit: Visit, drift: Drift, dates: list[str], motor: str) -> list[
     known = visit.desk.known.robot
     values = []
     for day in dates:
-        end = datetime.fromisoformat(day).replace(tzinfo=UTC).timestamp() + 86_400.0
-        before = [k for k, at in enumerate(drift.at) if at.timestamp() < end]
+        before = [k for k, at in enumerate(drift.at) if visit.day(at) <= day]
         values.append(before[-1] if before else 0)
-    angle = drift.unit == "rad" and motor in known.motor_names
+    angle = drift.unit.startswith("rad") and motor in known.motor_names
 
     def word(value: float) -> str:
         if angle:
-            return visit.angle(value, known, known.motor_names.index(motor), relative=True)
+            told = visit.angle(value, known, known.motor_names.index(motor), relative=True)
+            return told + drift.unit.removeprefix("rad")
         return f"{value:.4g} {drift.unit}"
 
-    told = [f"{word(drift.values[k])} ± {word(abs(drift.deviations[k]))}" for k in values]
+    told = [
+        f"{word(drift.values[k])} ± {word(drift.deviations[k]).removeprefix('-')}" for k in values
+    ]
     change = drift.values[values[1]] - drift.values[values[0]]
     return [*told, word(change)]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from typing import TYPE_CHECKING
 from zoneinfo import ZoneInfo
 
@@ -23,11 +25,19 @@ if TYPE_CHECKING:
 
 EXPIRY_S = 5.0
 """Time between two looks whether the session has ended [s]."""
+DIGITS = {"deg": 1, "rad": 3, "counts": 0}
+"""Digits after the point, by unit; small differences have one more."""
+NUMBER = re.compile(r"(\+- )?([+-]?\d+(?:\.\d+)?)")
+DEGREES = re.compile(
+    rf"(?P<place>stuck at )?(?P<values>{NUMBER.pattern}(?: (?:to )?{NUMBER.pattern})*) deg\b"
+)
+"""Angles in a text: where a motor stands, or differences or speeds, with deviations or ranges."""
 CHOICES = {"theme": texts.THEMES, "unit": texts.UNIT_NAMES}
 YEAR_S = 31_536_000
 COLOURS = {
     "alarm": "#b3261e",
     "suspected": "#8a5a00",
+    "set_up": "#96318f",
     "undecided": "#6b4fa0",
     "stale": "#5a6470",
     "waiting": "#5a6470",
@@ -58,12 +68,42 @@ table.plain th, table.plain td { text-align: left; padding: .25rem .6rem; vertic
 a.reason { display: block; }
 .scroll { overflow: auto; max-height: 24rem; }
 .soft { opacity: .85; font-size: .9rem; }
-:focus-visible { outline: 3px solid #d98e00; outline-offset: 2px; }
+/* Of important rules those of the first layer win, also over "no-outline" of Quasar. */
+@layer theme { :focus-visible, .kept, .q-field:has(:focus-visible) { outline-offset: 0 !important;
+  outline: 3px solid #ffbf47 !important; box-shadow: 0 0 0 5px #16191c !important; }
+  .q-btn--outline, .q-btn--flat { color: var(--link) !important; } }
 """ + "\n".join(f".state-{name} {{ background: {colour}; }}" for name, colour in COLOURS.items())
 ZONE_COOKIE = (
-    "<script>document.cookie='zone='+Intl.DateTimeFormat().resolvedOptions().timeZone+"
-    f"';path=/;SameSite=Strict;max-age={YEAR_S}'</script>"
+    "<script>{const zone='zone='+Intl.DateTimeFormat().resolvedOptions().timeZone;"
+    "const known=()=>document.cookie.split('; ').includes(zone);if(!known()){"
+    f"document.cookie=zone+';path=/;SameSite=Strict;max-age={YEAR_S}';if(known())location.reload()}}}}"
+    "</script>"
 )
+"""Tells the server the time zone of the browser; a page that was made without it is made anew."""
+FOCUS = """<script>{
+const all = () => [...document.querySelectorAll(
+  '.page :is(a[href], button, input, select, [tabindex="0"]), header select')];
+const words = (one) =>
+  one.tagName + (one.getAttribute('aria-label') || one.name || one.textContent);
+let last = null, said = sessionStorage.focus, place = 0;
+sessionStorage.removeItem('focus');
+addEventListener('focusin', (e) => {
+  if (!e.target.matches(':focus-visible, .kept')) return;
+  last = e.target; said = words(last); place = all().indexOf(last); });
+addEventListener('focusout', (e) => setTimeout(() => {
+  if (last === e.target && last.isConnected) last = said = null; }));
+addEventListener('beforeunload', () => { if (last) sessionStorage.focus = words(last); });
+new MutationObserver(() => {
+  if (!said || last?.isConnected || document.activeElement !== document.body) return;
+  const found = all(), same = found.find((one) => words(one) === said);
+  const next = same || (last && found[Math.min(place, found.length - 1)]);
+  if (!next) return;
+  next.classList.add('kept');
+  next.addEventListener('blur', () => next.classList.remove('kept'), {once: true});
+  next.focus({preventScroll: true});
+}).observe(document, {childList: true, subtree: true});
+}</script>"""
+"""Keeps the focus, where it is seen, of a part that is drawn anew and of a page loaded again."""
 RELOAD = (
     "<script>{let was=false,n=0;setInterval(async()=>{if(window.socket?.connected)was=true;"
     f"else if(++n%12===0&&(was||n>=120))try{{await fetch('{ALIVE}');location.reload()}}catch{{}}"
@@ -113,6 +153,10 @@ class Visit:
         """Whether the person may change the store."""
         return self.session.may(CONFIRM)
 
+    def day(self, at: datetime) -> str:
+        """Return the day of a time in the zone of the reader."""
+        return f"{at.astimezone(self.zone):%Y-%m-%d}"
+
     def time(self, at: datetime | None, seconds: bool = False) -> str:
         """Return a time in the zone of the reader."""
         if at is None:
@@ -123,13 +167,48 @@ class Visit:
         """Return an angle of a motor [rad], or a place of one that slides [m], in words."""
         if robot.slides[motor]:
             return f"{1e3 * value:.1f} mm"
+        told, unit = self._shown(value, robot, relative)
+        return f"{told:.{DIGITS[unit] + relative}f} {unit}"
+
+    def held(self, told: float, robot: Robot, motor: int) -> float:
+        """Return the angle [rad] or place [m] that a number in the unit of the reader means."""
+        if robot.slides[motor]:
+            return 1e-3 * told
+        zero, one = (self._shown(value, robot)[0] for value in (0.0, 1.0))
+        return (told - zero) / (one - zero)
+
+    def unit_of(self, robot: Robot) -> str:
+        """Return the unit in which angles of a robot are shown."""
+        return self._shown(0.0, robot)[1]
+
+    def words(self, text: str, robot: Robot | None) -> str:
+        """Return a text whose angles, in degrees, are put into the unit of the reader.
+
+        Those of a robot whose profile is not known stay in degrees.
+        """
+        if robot is None or self.unit == "deg":
+            return text
+
+        unit = self.unit_of(robot)
+
+        def number(relative: bool, found: re.Match[str]) -> str:
+            value, _ = self._shown(float(np.deg2rad(float(found[2]))), robot, relative)
+            value = abs(value) if found[1] else value
+            return f"{found[1] or ''}{value:.{DIGITS[unit]}f}"
+
+        def told(found: re.Match[str]) -> str:
+            place = found["place"] or ""
+            return f"{place}{NUMBER.sub(partial(number, not place), found['values'])} {unit}"
+
+        return DEGREES.sub(told, text)
+
+    def _shown(self, value: float, robot: Robot, relative: bool = False) -> tuple[float, str]:
+        """Return an angle [rad] in the unit of the reader, and its name."""
         if self.unit == "counts" and robot.profile.servo_units is not None:
             counts = robot.servo_units.to_counts(np.array(value))
             zero = robot.servo_units.to_counts(np.array(0.0)) if relative else 0.0
-            return f"{float(counts - zero):.0f} counts"
-        if self.unit == "rad":
-            return f"{value:.3f} rad"
-        return f"{np.rad2deg(value):.1f} deg"
+            return float(counts - zero), "counts"
+        return (value, "rad") if self.unit == "rad" else (float(np.rad2deg(value)), "deg")
 
 
 def _zone(cookies: Mapping[str, str]) -> ZoneInfo | None:
@@ -146,7 +225,7 @@ def page(visit: Visit, title: str) -> Iterator[None]:
     ui.colors(primary="#1f5f99", negative="#b3261e", positive="#1b6e3c", warning="#8a5a00")
     ui.dark_mode({"auto": None, "light": False, "dark": True}[visit.theme])
     ui.add_css(STYLE)
-    ui.add_head_html(ZONE_COOKIE + RELOAD)
+    ui.add_head_html(ZONE_COOKIE + FOCUS + RELOAD)
     with ui.header().classes("items-center gap-4 py-2").props("elevated"):
         with ui.element("nav").classes("flex gap-4").props('aria-label="Main"'):
             for name, target in (
@@ -184,7 +263,7 @@ def _choice(value: str, name: str, label: str) -> None:
         draw.text(label, "span")
         with (
             ui.element("select")
-            .props(f'onchange="{chosen};location.reload()"')
+            .props(f'name="{name}" onchange="{chosen};location.reload()"')
             .classes("text-black bg-white rounded px-1")
         ):
             for key, shown in CHOICES[name].items():

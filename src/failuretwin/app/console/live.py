@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from threading import Event, Thread
 
 import numpy as np
@@ -26,6 +27,7 @@ from failuretwin.decision.streaming.fleet import MOVEMENTS, SILENCE_S
 from failuretwin.decision.streaming.monitor import FaultMonitor
 from failuretwin.decision.streaming.set_up_watch import PROOF
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+from failuretwin.inference.explanation import set_up_doubt
 
 KEPT_S = 600.0
 """Time of a live robot that can be replayed [s]."""
@@ -35,6 +37,8 @@ POSTERIOR_S = 1.0
 """Time between two kept posteriors [s]."""
 SHOWN_CHANGES = 8
 POLL_S = 0.1
+HANGS_S = 60.0
+"""Time without a step from which a watch counts as hanging [s]; a new alarm takes up to 20."""
 
 STATES = {
     "OK": shown.HEALTHY,
@@ -57,6 +61,7 @@ class LiveSettings:
         wait_s: Longest delay of commands [s].
         faults: Faults of an emulated arm, which its emulated check has too.
         place: Network of the real arm; empty: emulated or a log.
+        topics: File that names its topics; None: as usual.
     """
 
     name: str
@@ -66,6 +71,7 @@ class LiveSettings:
     wait_s: float = 0.0
     faults: tuple[str, ...] = ()
     place: str = ""
+    topics: Path | None = None
 
 
 class LiveRobot(Sink):
@@ -89,6 +95,7 @@ class LiveRobot(Sink):
         )
         self._starts: deque[float] = deque(maxlen=MOVEMENTS)
         self._begun = 0
+        self._seen_s = np.inf
         self._heard: datetime | None = None
         self._stopped = Event()
         motors = settings.known.robot.motor_names
@@ -106,6 +113,15 @@ class LiveRobot(Sink):
     def stop(self) -> None:
         """End the watch."""
         self._stopped.set()
+
+    @property
+    def tile(self) -> Tile:
+        """The robot on the wall; it is stale if its watch hangs."""
+        tile, silent_s = self.view.tile, time.monotonic() - self._seen_s
+        if silent_s < HANGS_S or tile.state == shown.STALE:
+            return tile
+        said = texts.LAST_WORD.format(said=tile.said)
+        return replace(tile, state=shown.STALE, said=said)
 
     def trace(self) -> Trace:
         """Return the motion of the last minutes."""
@@ -137,6 +153,9 @@ class LiveRobot(Sink):
                 self._watch(self.settings.open_source(stack))
         except FailureTwinError as error:
             self._end(str(error))
+        except Exception as error:  # whatever it was, nobody watches this robot any more
+            self._end(texts.WATCH_FAILED.format(why=f"{type(error).__name__}: {error}"))
+            raise
 
     def _watch(self, source: Source) -> None:
         own = self.settings
@@ -172,6 +191,7 @@ class LiveRobot(Sink):
         due = not self._posterior or at >= self._posterior[-1][0] + POSTERIOR_S
         if due and answer.state == OK and diagnosis is not None and not diagnosis.undecided:
             self._posterior.append((at, diagnosis.posterior))
+        self._seen_s = time.monotonic()
         now = tuple(statuses(answer, self.settings.known.robot.motor_names))
         changes = tuple(list(self._changes.lines)[-SHOWN_CHANGES:])
         self.view = LiveView(
@@ -203,16 +223,16 @@ class LiveRobot(Sink):
         if waiting and self._heard is not None and word == "STALE":
             silent = (datetime.now(UTC) - self._heard).total_seconds() > SILENCE_S
             state = shown.STALE if silent else shown.WAITING
-        set_up = own.monitor.set_up
-        if set_up and state == shown.HEALTHY:
-            state, said = shown.UNDECIDED, texts.SET_UP.format(finding=set_up)
+        diagnosis = shadow.snapshot.answer.diagnosis
+        remarks = [] if diagnosis is None else [diagnosis.undecided, *diagnosis.quality]
+        doubt = own.monitor.set_up or set_up_doubt(remarks)
         mode = shown.modes_of([alarm.cause]) if alarm.cause else ""
-        return Tile(own.name, own.known.robot.name, state, mode, printable(said), self._heard)
+        tile = Tile(own.name, own.known.robot.name, state, mode, printable(said), self._heard)
+        return tile.doubted(printable(doubt))
 
     def _end(self, why: str) -> None:
         """Show the robot as stale, with its last word."""
         tile = self.view.tile
-        said = why or tile.said
-        if not why and tile.state != shown.STALE:
-            said = texts.LAST_WORD.format(said=tile.said)
+        said = tile.said if tile.state == shown.STALE else texts.LAST_WORD.format(said=tile.said)
+        said = f"{why}; {said}" if why else said
         self.view = replace(self.view, tile=replace(tile, state=shown.STALE, said=printable(said)))

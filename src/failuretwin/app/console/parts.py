@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
-from nicegui import ui
+from nicegui import run, ui
 
 from failuretwin.app.console import draw, texts
 from failuretwin.app.console import state as shown
 from failuretwin.app.console.layout import Visit
 from failuretwin.app.console.state import Trace
+from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.robot_state import robot_state
@@ -23,7 +24,11 @@ MOVEMENT = re.compile(r"movement (\d+)\b")
 
 
 def reasons(
-    diagnosis: Diagnosis, trace: Trace, robot: Robot, movement: Callable[[str, float], object]
+    visit: Visit,
+    diagnosis: Diagnosis,
+    trace: Trace,
+    robot: Robot,
+    movement: Callable[[str, float], object],
 ) -> None:
     """Draw why, and what to do now; `movement` draws a reason that leads to its time [s]."""
     draw.heading(texts.WHY)
@@ -32,11 +37,11 @@ def reasons(
         found = MOVEMENT.match(line)
         at = starts.get(int(found[1])) if found else None
         if at is not None:
-            movement(line, at)
+            movement(visit.words(line, robot), at)
         elif not line.startswith(STEP):
-            draw.text(line)
+            draw.text(visit.words(line, robot))
     draw.heading(texts.NEXT)
-    draw.text(robot_state([diagnosis], robot).step)
+    draw.text(visit.words(robot_state([diagnosis], robot).step, robot))
 
 
 def motor_table(robot: Robot, diagnosis: Diagnosis) -> None:
@@ -47,9 +52,23 @@ def motor_table(robot: Robot, diagnosis: Diagnosis) -> None:
     draw.table((texts.MOTOR, texts.PROBABILITY), rows)
 
 
-def asked(title: str, words: str, work: Callable[[], list[str]], note: str = "") -> None:
-    """Draw a section whose lines are worked out when they are asked for."""
-    draw.heading(title)
+def asked(
+    visit: Visit,
+    robot: Robot | None,
+    heads: tuple[str, str],
+    work: Callable[[], list[str]],
+    note: str = "",
+) -> None:
+    """Draw a section whose lines are worked out when they are asked for.
+
+    Args:
+        visit: The page.
+        robot: The robot that the lines are of; None: its profile is not known.
+        heads: Its heading, and the words of its button.
+        work: Returns the lines.
+        note: What to know first; empty: nothing.
+    """
+    draw.heading(heads[0])
     if note:
         draw.text(note).classes("soft")
     lines = ui.element("div").props('role="status"')
@@ -58,13 +77,16 @@ def asked(title: str, words: str, work: Callable[[], list[str]], note: str = "")
         lines.clear()
         with lines:
             draw.text(texts.WORKING)
-        found = await draw.worked(work)
+        try:
+            found = await run.io_bound(work)
+        except FailureTwinError as error:
+            found = [str(error)]
         lines.clear()
         with lines:
             for line in found or [texts.NOTHING]:
-                draw.text(line)
+                draw.text(visit.words(line, robot))
 
-    draw.button(words, ask)
+    draw.button(heads[1], ask)
 
 
 class Angles:

@@ -53,22 +53,18 @@ class Replay:
                 self._scene = ArmScene(known.robot, texts.ARM)
                 self._clock = draw.text("").props('role="status"')
                 start = min(max(at, low), high)
-                self._slider = ui.slider(
-                    min=low, max=high, step=0.02, value=start, on_change=self._move
-                )
-                self._slider.props(f'aria-label="{texts.SLIDER}"')
+                self._slider = draw.Slider((low, high), 0.02, start, texts.SLIDER, self._move)
                 self._timer = ui.timer(PLAY_S, self._step, active=False)
                 self._play = draw.button(texts.PLAY, self._toggle)
                 self._angles = parts.Angles(visit, known.robot)
             with ui.element("section"):
                 if diagnosis is not None:
                     draw.heading(texts.VERDICT)
-                    draw.text(diagnosis.verdict)
-                    parts.reasons(diagnosis, trace, known.robot, self._button)
+                    draw.text(visit.words(diagnosis.verdict, known.robot))
+                    parts.reasons(visit, diagnosis, trace, known.robot, self._button)
                     parts.motor_table(known.robot, diagnosis)
-                parts.asked(
-                    texts.BLIND, texts.ASK_BLIND, lambda: visit.desk.blind_spots(trace, known)
-                )
+                blind = texts.BLIND, texts.ASK_BLIND
+                parts.asked(visit, known.robot, blind, lambda: visit.desk.blind_spots(trace, known))
             with ui.element("section"):
                 self._charts = Charts(known, with_posterior=bool(trace.posterior))
                 draw.later(self._draw_charts)
@@ -77,10 +73,10 @@ class Replay:
 
     def _button(self, reason: str, at: float) -> None:
         button = draw.button(reason, lambda: self._go_to(at))
-        button.props("flat").classes("reason")
+        button.props("flat align=left").classes("reason")
 
     def _go_to(self, at: float) -> None:
-        self._slider.set_value(at)
+        self._slider.go_to(at)
 
     def _toggle(self) -> None:
         self._timer.active = not self._timer.active
@@ -88,8 +84,8 @@ class Replay:
 
     def _step(self) -> None:
         end = float(self._trace.time[-1])
-        self._slider.set_value(min(float(self._slider.value) + PLAY_S, end))
-        if float(self._slider.value) >= end:
+        self._slider.go_to(self._slider.value + PLAY_S)
+        if self._slider.value >= end:
             self._toggle()
 
     def _diagnosis_at(self, at: float) -> Diagnosis | None:
@@ -99,7 +95,7 @@ class Replay:
 
     def _move(self) -> None:
         """Draw the moment of the slider."""
-        trace, at = self._trace, float(self._slider.value)
+        trace, at = self._trace, self._slider.value
         k = int(np.clip(np.searchsorted(trace.time, at), 0, len(trace.time) - 1))
         seen = np.flatnonzero(np.isfinite(trace.measured).all(axis=1))
         near = seen[np.argmin(np.abs(trace.time[seen] - at))] if len(seen) else k
@@ -118,5 +114,5 @@ class Replay:
 
     def _mark(self) -> None:
         """Mark the moment in the charts."""
-        self._marked = float(self._slider.value)
+        self._marked = self._slider.value
         self._charts.mark(self._marked)

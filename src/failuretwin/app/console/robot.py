@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
 from nicegui import ui
 
 from failuretwin.app.console import draw, parts, texts
@@ -18,10 +16,12 @@ from failuretwin.app.console.live import LiveRobot
 from failuretwin.app.console.state import LiveView
 from failuretwin.core.foreign import printable
 from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.data_knowledge.records.overview import StoredRun
 from failuretwin.decision.acting.reach import Reach, reach, workspace
 from failuretwin.decision.robot_state import robot_state
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
+from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.explanation import percent
 
 FRAME_S, CHART_S = 0.1, 1.0
@@ -44,17 +44,19 @@ def show(visit: Visit, name: str) -> None:
             ui.link(texts.HISTORY, draw.link_to("history", name=name))
             ui.link(texts.CHECK, draw.link_to("check", name=name))
         known = desk.robot(name)
+        robot = None if known is None else known.robot
         if live is not None:
             LivePage(visit, live)
         else:
-            draw.badge(tile.state)
-            draw.text(tile.said)
+            draw.badges(tile.states)
+            draw.text(visit.words(tile.said, robot))
             draw.text(visit.time(tile.heard)).classes("soft")
             _stored_arm(visit, name, known)
-        _runs(visit, name)
+        _runs(visit, name, robot)
         if known is not None:
             ReachPart(visit, known)
-        parts.asked(texts.LIFE, texts.ASK_LIFE, lambda: desk.remaining_life(name), texts.LIFE_NOTE)
+        life = texts.LIFE, texts.ASK_LIFE
+        parts.asked(visit, robot, life, lambda: desk.remaining_life(name), texts.LIFE_NOTE)
 
 
 def _stored_arm(visit: Visit, name: str, known: CalibratedRobot | None) -> None:
@@ -73,27 +75,34 @@ def _stored_arm(visit: Visit, name: str, known: CalibratedRobot | None) -> None:
         with ui.element("section"):
             if last is not None:
                 draw.heading(texts.NEXT)
-                draw.text(robot_state([last], known.robot).step)
+                draw.text(visit.words(robot_state([last], known.robot).step, known.robot))
                 parts.motor_table(known.robot, last)
 
 
-def _runs(visit: Visit, name: str) -> None:
-    """Draw the list of stored runs, each with its replay."""
+def _runs(visit: Visit, name: str, robot: Robot | None) -> None:
+    """Draw the list of stored runs, each with its replay and its page for technicians."""
     runs = visit.desk.stored_runs(name)
     if not runs:
         return
     draw.heading(texts.RUNS)
 
-    def play(row: int, log: str) -> Callable[[], object]:
-        if not Path(log).exists():
-            return lambda: draw.text(texts.NO_LOG, "span").classes("soft")
-        address = draw.link_to("replay", name=name, run=row)
-        return lambda: ui.link(texts.PLAY, address).props(f'aria-label="{texts.PLAY} {row}"')
+    def link(words: str, page_name: str, one: StoredRun) -> draw.Cell:
+        if not Path(one.log).exists():
+            return texts.NO_LOG
+        address = draw.link_to(page_name, name=name, run=one.row)
+        return lambda: ui.link(words, address).props(f'aria-label="{words}: {one.row}"')
 
     rows: list[list[draw.Cell]] = [
-        [visit.time(one.at), one.name, one.verdict, play(one.row, one.log)] for one in runs
+        [
+            visit.time(one.at),
+            one.name,
+            visit.words(one.verdict, robot),
+            link(texts.PLAY, "replay", one),
+            link(texts.REPORT, "technician", one),
+        ]
+        for one in runs
     ]
-    draw.table((texts.WHEN, texts.RUN, texts.VERDICT, texts.PLAY), rows)
+    draw.table((texts.WHEN, texts.RUN, texts.VERDICT, texts.PLAY, texts.REPORT), rows)
 
 
 class ReachPart:
@@ -105,21 +114,25 @@ class ReachPart:
         draw.heading(texts.REACH)
         with ui.row().classes("items-end gap-4"):
             self._motor = draw.Choice(["", *known.robot.motor_names], "", texts.MOTOR)
-            self._angle = ui.number(texts.ANGLE, value=0.0).classes("short")
+            words = texts.ANGLE.format(unit=visit.unit_of(known.robot))
+            start = visit.angle(0.0, known.robot, 0).split()[0]
+            self._angle = ui.number(words, value=float(start)).classes("short")
             draw.button(texts.ASK_REACH, self._ask)
         self._line = draw.text("").props('role="status"')
         self._place = ui.element("div")
 
     async def _ask(self) -> None:
         robot, motor = self._known.robot, self._motor.value
-        angle = float(np.deg2rad(float(self._angle.value or 0.0)))
-        held = (motor, angle) if motor in robot.motor_names else None
+        held = None
+        if motor in robot.motor_names:
+            at = robot.motor_names.index(motor)
+            held = motor, self._visit.held(float(self._angle.value or 0.0), robot, at)
         found = await draw.worked(_reach, self._known, held)
         if found is None:
             return
         said = texts.ALL_REACHED.format(share=found.share)
         if held is not None:
-            told = self._visit.angle(angle, robot, robot.motor_names.index(motor))
+            told = self._visit.angle(held[1], robot, robot.motor_names.index(motor))
             said = texts.REACHED.format(share=found.share, motor=motor, angle=told)
         self._line.set_text(said)
         if self._scene is None:
@@ -158,8 +171,9 @@ class LivePage:
                 draw.heading(texts.CHANGES)
                 self._changes = ui.element("div")
                 parts.asked(
-                    texts.BLIND,
-                    texts.ASK_BLIND,
+                    visit,
+                    robot,
+                    (texts.BLIND, texts.ASK_BLIND),
                     lambda: visit.desk.blind_spots(live.trace(), self._known),
                 )
         self._say()
@@ -192,29 +206,35 @@ class LivePage:
 
     def _say(self) -> None:
         """Tell the verdict, unless it stands there."""
-        view = self._live.view
-        said = (view.tile.state, view.tile.said, view.diagnosis, len(view.changes))
+        view, tile = self._live.view, self._live.tile
+        said = (tile.state, tile.said, view.diagnosis, len(view.changes))
         if said == self._said:
             return
-        self._said = said
+        self._said, words, robot = said, self._visit.words, self._known.robot
         self._verdict.clear()
         with self._verdict:
             draw.heading(texts.VERDICT)
-            draw.badge(view.tile.state)
-            draw.text(view.tile.said)
+            draw.badges(tile.states)
+            draw.text(words(tile.said, robot))
             self._say_alarm(view)
             if view.diagnosis is not None:
-                parts.reasons(view.diagnosis, self._live.trace(), self._known.robot, self._link)
+                trace = self._live.trace()
+                parts.reasons(self._visit, view.diagnosis, trace, robot, self._link)
             draw.heading(texts.MOTORS)
             rows = [
-                [one.name, one.state, percent(float(one.values.get("probability", 0))), one.message]
+                [
+                    one.name,
+                    one.state,
+                    percent(float(one.values.get("probability", 0))),
+                    words(one.message, robot),
+                ]
                 for one in view.statuses[1:]
             ]
             draw.table((texts.MOTOR, texts.STATE, texts.PROBABILITY, texts.SAYS), rows)
         self._changes.clear()
         with self._changes:
             for change in reversed(view.changes):
-                draw.text(str(change))
+                draw.text(words(str(change), robot))
 
     def _say_alarm(self, view: LiveView) -> None:
         episode, sample = view.alarm.episode, view.sample

@@ -127,6 +127,10 @@ def _add_pages(desk: Desk, visit_of: Callable[[Request], Visit]) -> None:
     def import_page(request: Request) -> None:
         act.show_import(visit_of(request))
 
+    @app.get("/technician")
+    def technician_page(name: str = "", run: int = 0) -> HTMLResponse:
+        return HTMLResponse(act.run_report(desk, name, run))
+
     @app.get("/report/{number}")
     def report_page(number: int) -> HTMLResponse:
         return HTMLResponse(act.report_page(desk, number))

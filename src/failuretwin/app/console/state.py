@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -18,9 +18,10 @@ from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.records import CHECK_DAYS
 from failuretwin.data_knowledge.records.overview import RobotGlance
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
+from failuretwin.inference.explanation import set_up_doubt
 
-ALARM, SUSPECTED, UNDECIDED, STALE, WAITING, HEALTHY = texts.STATES
-WORST_FIRST = (ALARM, SUSPECTED, UNDECIDED, STALE, WAITING, HEALTHY)
+ALARM, SUSPECTED, SET_UP, UNDECIDED, STALE, WAITING, HEALTHY = texts.STATES
+WORST_FIRST = (ALARM, SUSPECTED, SET_UP, UNDECIDED, STALE, WAITING, HEALTHY)
 SUSPECT = 0.05
 """Probability from which the drawn arm lets a motor differ from its command."""
 LONGEST_TEXT = 300
@@ -39,6 +40,7 @@ class Tile:
         mode: Fault modes that are named, joined by commas.
         said: The state in words.
         heard: When it was last heard (UTC); None: never.
+        set_up: Why its set-up is uncertain; empty: it is not.
     """
 
     name: str
@@ -47,6 +49,7 @@ class Tile:
     mode: str
     said: str
     heard: datetime | None
+    set_up: str = ""
 
     @property
     def site(self) -> str:
@@ -54,13 +57,27 @@ class Tile:
         head, dash, _ = self.name.partition("-")
         return head if dash else ""
 
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Its state, and `SET_UP` where its set-up is uncertain besides."""
+        return (self.state, SET_UP) if self.set_up and self.state != SET_UP else (self.state,)
+
+    def doubted(self, set_up: str) -> Tile:
+        """Return it with what is to be said of its set-up; empty: nothing."""
+        if not set_up:
+            return self
+        state = SET_UP if self.state in (HEALTHY, UNDECIDED) else self.state
+        told = texts.SET_UP.format(said=self.said, finding=set_up)
+        said = self.said if set_up in self.said else told
+        return replace(self, state=state, said=said, set_up=set_up)
+
     def record(self) -> dict[str, Any]:
         """Return it for the page."""
         return {
             "name": self.name,
             "kind": self.kind,
             "site": self.site,
-            "state": self.state,
+            "states": self.states,
             "rank": WORST_FIRST.index(self.state),
             "mode": self.mode,
             "said": printable(self.said)[:LONGEST_TEXT],
@@ -158,7 +175,8 @@ def stored_tile(glance: RobotGlance, now: datetime) -> Tile:
     state = ALARM if glance.faults else _STATES.get(glance.state, UNDECIDED)
     if silent:
         state, said = STALE, texts.LAST_WORD.format(said=said)
-    return Tile(glance.robot, glance.kind, state, mode, said, glance.at)
+    tile = Tile(glance.robot, glance.kind, state, mode, said, glance.at)
+    return tile.doubted(set_up_doubt(glance.remarks))
 
 
 _STATES = {HEALTHY_STATE: HEALTHY, FAULTY_STATE: ALARM}
@@ -195,7 +213,8 @@ def fleet_tiles(status: Mapping[str, Any], kinds: Mapping[str, str], now_s: floa
             if state == STALE:
                 said = texts.LAST_WORD.format(said=said)
             heard = datetime.fromtimestamp(one["heard"], UTC) if one["heard"] > 0 else None
-            tiles.append(Tile(name, kinds.get(name, ""), state, mode, said, heard))
+            tile = Tile(name, kinds.get(name, ""), state, mode, said, heard)
+            tiles.append(tile.doubted(set_up_doubt([cause])))
     return tiles
 
 

@@ -24,6 +24,7 @@ NO_PROFILE = "The profile of this robot is not known here, so its arm is not dra
 STATES = {
     "alarm": "alarm",
     "suspected": "suspected",
+    "set_up": "set-up uncertain",
     "undecided": "undecided",
     "stale": "stale",
     "waiting": "no verdict yet",
@@ -32,6 +33,7 @@ STATES = {
 SIGNS = {
     "alarm": "✕",
     "suspected": "!",
+    "set_up": "≠",
     "undecided": "?",
     "stale": "=",
     "waiting": "…",
@@ -39,15 +41,13 @@ SIGNS = {
 }
 LAST_WORD = "last word: {said}"
 NEVER = "nothing was heard yet"
+WATCH_FAILED = "the watch has failed: {why}"
 SIMULATING = "The demo simulates its year of history: {done} of {all} robots are there."
-SET_UP = "the set-up is uncertain: {finding}"
+SET_UP = "{said}; set-up: {finding}"
 
 WALL_TEXTS = {
     "search": "Search",
-    "kind": "Kind",
-    "site": "Site",
-    "mode": "Fault mode",
-    "state": "State",
+    "filters": {"kind": "Kind", "site": "Site", "mode": "Fault mode", "states": "State"},
     "all": "all",
     "none": "No robot matches.",
     "heard": "heard",
@@ -61,6 +61,7 @@ VERDICT, SINCE, WHY, NEXT = "Verdict", "Since", "Why", "What to do now"
 ALARM_SINCE = "alarm number {number}, since {time}"
 MOTORS, MOTOR, STATE, PROBABILITY, SAYS = "Motors", "Motor", "State", "Fault probability", "Says"
 ARM = "Arm: solid where it is, transparent where it was told to be"
+VIEW, CORNER, FRONT, SIDE, ABOVE = "View", "Corner", "Front", "Side", "Above"
 ARM_AT_REST = "Arm at rest, its motors coloured by the last run"
 ARM_NOTE = "The solid arm is drawn from the measured tool and the suspected motor."
 POSTERIOR, RESIDUALS = "Probability over time", "Residuals by motor [mm]"
@@ -69,7 +70,7 @@ RESIDUAL_NOTE = "What remains of the tool error if only this motor differs from 
 TOTAL = "tool error"
 ANGLES, TOLD, DRAWN = "Angles", "Told", "Drawn"
 BLIND, ASK_BLIND = "What the motion could not show", "Work it out"
-REACH, ASK_REACH, ANGLE = "What it can still reach", "Show", "Held at [deg]"
+REACH, ASK_REACH, ANGLE = "What it can still reach", "Show", "Held at [{unit}]"
 REACHED = "{share:.0%} of the usual workspace with {motor} held at {angle}"
 ALL_REACHED = "{share:.0%} of the usual workspace"
 LIFE, ASK_LIFE = "Remaining life", "Estimate"
@@ -105,7 +106,7 @@ STOP_NOTE = "No emergency stop: keep the real one in reach. It works from any wi
 STOPPED_BY = "stopped by {name}"
 STOP_SENT, NO_CHECK = "Told to stop.", "No check is running."
 HANG = "the console hangs"
-GONE = "the page that started the check is gone"
+GONE = "the page that started the check is closed, or hangs"
 BUSY = "A check is running. Wait for it, or stop it."
 STARTED, FINISHED = "the check of {robot} has begun", "the check is over"
 

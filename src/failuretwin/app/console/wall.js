@@ -4,21 +4,21 @@ export default {
     <section>
       <form class="wall-filters" role="search" @submit.prevent>
         <label>{{ words.search }} <input type="search" v-model="search" name="search"></label>
-        <label v-for="key in ['kind', 'site', 'mode', 'state']" :key="key">{{ words[key] }}
+        <label v-for="key in ['kind', 'site', 'mode', 'states']" :key="key">{{ words.filters[key] }}
           <select v-model="chosen[key]" :name="key">
             <option value="">{{ words.all }}</option>
             <option v-for="value in values(key)" :key="value" :value="value">
-              {{ key === 'state' ? words.states[value] : value }}</option>
+              {{ key === 'states' ? words.states[value] : value }}</option>
           </select></label>
         <output>{{ visible.length }} {{ words.shown }} {{ tiles.size }} {{ words.robots }}</output>
       </form>
       <p v-if="!visible.length" role="status">{{ words.none }}</p>
       <ul class="wall">
         <li v-for="tile in visible" :key="tile.name">
-          <a :href="'/robot?name=' + encodeURIComponent(tile.name)" :class="'edge-' + tile.state">
+          <a :href="'/robot?name=' + encodeURIComponent(tile.name)" :class="'edge-' + tile.states[0]">
             <strong>{{ tile.name }}</strong>
-            <span :class="'state state-' + tile.state">
-              {{ words.signs[tile.state] }} {{ words.states[tile.state] }}</span>
+            <span class="badges"><span v-for="state in tile.states" :key="state" :class="'state state-' + state">
+              {{ words.signs[state] }} {{ words.states[state] }}</span></span>
             <span class="said">{{ tile.said }}</span>
             <small>{{ [tile.kind, tile.site].filter(Boolean).join(', ') }}
               <template v-if="tile.heard">{{ words.heard }} {{ time(tile.heard) }}</template></small>
@@ -31,7 +31,7 @@ export default {
     return {
       tiles: new Map(),
       search: "",
-      chosen: { kind: "", site: "", mode: "", state: "" },
+      chosen: { kind: "", site: "", mode: "", states: "" },
       format: new Intl.DateTimeFormat("sv-SE", { dateStyle: "short", timeStyle: "medium" }),
     };
   },
@@ -51,7 +51,7 @@ export default {
   },
   methods: {
     parts(tile, key) {
-      return key === "mode" ? tile.mode.split(", ") : [tile[key]];
+      return key === "mode" ? tile.mode.split(", ") : [tile[key]].flat();
     },
     values(key) {
       const found = new Set([...this.tiles.values()].flatMap((tile) => this.parts(tile, key)));

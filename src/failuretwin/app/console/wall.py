@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from nicegui import ui
 
 from failuretwin.app.console import draw, texts
 from failuretwin.app.console.layout import COLOURS, Visit, page
+from failuretwin.app.console.state import Tile
 
 PERIOD_S = 1.0
 """Time between two updates [s]."""
@@ -23,7 +25,7 @@ STYLE = """
 .wall a { display: flex; flex-direction: column; gap: .15rem; height: 100%; padding: .5rem .7rem;
   border: 1px solid var(--line); border-left-width: .5rem; border-radius: .4rem; color: inherit;
   background: var(--soft); text-decoration: none; overflow-wrap: anywhere; }
-.wall a .state { align-self: start; }
+.wall a .badges { display: flex; flex-wrap: wrap; gap: .3rem; }
 .wall .said { font-size: .9rem; max-height: 4.2em; overflow: hidden; }
 """ + "\n".join(f".wall .edge-{name} {{ border-left-color: {c}; }}" for name, c in COLOURS.items())
 
@@ -58,12 +60,15 @@ def show(visit: Visit) -> None:
         wall = Wall()
         ready = False
 
+        def told(tile: Tile) -> Tile:
+            return replace(tile, said=visit.words(tile.said, visit.desk.profile(tile.kind)))
+
         def update() -> None:
             if not ready:
                 return
             trouble.set_text(visit.desk.trouble)
             note.set_text(visit.desk.note)
-            wall.show({tile.name: tile.record() for tile in visit.desk.tiles()})
+            wall.show({tile.name: told(tile).record() for tile in visit.desk.tiles()})
 
         def begin() -> None:
             nonlocal ready

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -194,15 +194,19 @@ class History:
 
     @property
     def health(self) -> str:
-        """One sentence on the state of the robot."""
+        """One sentence on the state of the robot, its days in UTC."""
+        return self.health_by(_day)
+
+    def health_by(self, day: Callable[[datetime], str]) -> str:
+        """Return the same sentence with days in another zone."""
         if self.open_episodes:
             return "; ".join(
-                f"{one.motor}: {one.mode}, {one.state}, since {_day(one.since)}"
+                f"{one.motor}: {one.mode}, {one.state}, since {day(one.since)}"
                 for one in self.open_episodes
             )
         if not self.recent:
             return "no open fault" if self.notes else "no run has been diagnosed"
-        return f"no open fault; last run ({_day(self.recent[-1].at)}): {self.recent[-1].state}"
+        return f"no open fault; last run ({day(self.recent[-1].at)}): {self.recent[-1].state}"
 
     @property
     def timeline(self) -> list[Moment]:

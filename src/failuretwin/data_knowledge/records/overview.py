@@ -27,6 +27,7 @@ class RobotGlance:
         state: State of that diagnosis; empty: none.
         verdict: Its verdict.
         faults: Open episodes that nobody refuted, ``MOTOR:MODE`` with whether each is confirmed.
+        remarks: Why it allows no verdict, and problems of its log, a line each.
     """
 
     robot: str
@@ -35,6 +36,7 @@ class RobotGlance:
     state: str
     verdict: str
     faults: Mapping[str, bool]
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ def read_overview(connection: sa.Connection) -> tuple[RobotGlance, ...]:
     query = (
         sa.select(kinds.c.robot_id, kinds.c.robot, kinds.c.kind)
         .add_columns(diagnoses.c.at, diagnoses.c.state, diagnoses.c.verdict)
+        .add_columns(diagnoses.c.undecided, diagnoses.c.quality)
         .select_from(kinds.outerjoin(diagnoses, diagnoses.c.id == last))
         .order_by(kinds.c.robot)
     )
@@ -84,8 +87,16 @@ def read_overview(connection: sa.Connection) -> tuple[RobotGlance, ...]:
         name = f"{one.motor}:{one.mode}"
         faults.setdefault(one.robot_id, {})[name] = one.verdict == CONFIRMED
     return tuple(
-        RobotGlance(robot, kind, at, state or "", verdict or "", faults.get(row, {}))
-        for row, robot, kind, at, state, verdict in connection.execute(query)
+        RobotGlance(
+            one.robot,
+            one.kind,
+            one.at,
+            one.state or "",
+            one.verdict or "",
+            faults.get(one.robot_id, {}),
+            (one.undecided or "", *(one.quality or ())),
+        )
+        for one in connection.execute(query)
     )
 
 

@@ -30,6 +30,7 @@ from failuretwin.inference.observation.rounding import Rounding, tool_rounding
 from failuretwin.inference.seen_runs import SURE, TOLD, set_up_finding, set_up_remark
 from failuretwin.inference.set_up_posterior import SetUpPosterior
 from failuretwin.inference.set_up_weighing import FEW
+from failuretwin.inference.set_ups.wrong_setup import MISFITS
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -170,7 +171,7 @@ class SetUpWatch:
         if self._found is None:
             return ""
         said = set_up_remark(self._found) if self._fitted else set_up_finding(self._found)
-        elsewhere = f"the log does not fit the profile: {self._elsewhere}"
+        elsewhere = f"{MISFITS}: {self._elsewhere}"
         return said or (elsewhere if self._elsewhere else "")
 
     @property
@@ -222,12 +223,12 @@ class SetUpWatch:
         if len(self._blamed) > CHANGES:
             named = ", then ".join(motor.replace("_", " ") for motor in self._blamed)
             return (
-                f"the log does not fit the profile: the motor that is blamed changes ({named}), "
+                f"{MISFITS}: the motor that is blamed changes ({named}), "
                 "and no mistake that is known explains it"
             )
         if young and not is_held(alarm.cause):
             fault = plain_name(Hypothesis.parse(alarm.cause))
-            return f"{fault}, or the log does not fit the profile: a few movements more tell"
+            return f"{fault}, or {MISFITS}: a few movements more tell"
         return ""
 
     @property

@@ -42,6 +42,7 @@ from failuretwin.inference.observation.registered import (
 )
 from failuretwin.inference.posterior import Posterior, marginal_likelihoods
 from failuretwin.inference.set_ups.set_ups import odd_zero
+from failuretwin.inference.set_ups.wrong_setup import ELSEWHERE
 
 TOLD = 0.9
 """Probability from which a run says what it had to assume of its robot."""
@@ -225,7 +226,7 @@ class Weighing:
         said = []
         if share[components.displaced].sum() > SURE:
             said.append(
-                "the sensor does not seem to stand where the profile says "
+                f"{ELSEWHERE} "
                 f"({share[components.displaced].sum():.1%}): the tool appears about "
                 f"{self._distance_mm(run):.2g} mm off{ALLOWED_FOR}. `failuretwin robot fit` on "
                 "healthy runs finds its frame"

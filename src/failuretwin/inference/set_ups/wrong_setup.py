@@ -17,6 +17,14 @@ from failuretwin.inference.set_ups.set_ups import SetUp, extent, simple_set_ups
 
 NOWHERE = "the tool is nowhere near where it should be"
 """What is said of a run that fits no hypothesis."""
+MISFITS, MAY_MISFIT = "the log does not fit the profile", "the log may not fit the profile"
+"""What is said of a set-up that is wrong, or may be."""
+ANOTHER = "no fault explains it, and the set-up is not wrong in one way that is known"
+"""What is said of a set-up that nothing explains."""
+ELSEWHERE = "the sensor does not seem to stand where the profile says"
+"""What is said of a sensor that was moved."""
+DOUBTS = (MISFITS, MAY_MISFIT, ANOTHER, ELSEWHERE, NOWHERE)
+"""Remarks by which a set-up is uncertain."""
 NEAR = 0.12
 """Median distance, in that of the poses from their middle, within which a set-up explains a log:
 sag and scatter of a printed arm take up half of it."""
