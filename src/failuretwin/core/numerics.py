@@ -43,7 +43,7 @@ def log_of(values: ArrayLike) -> FloatArray:
         return np.log(as_floats(values))
 
 
-SAME_LEVEL = 1e-9
+SAME_LEVEL = 1e-10
 """Probabilities that differ by less are equal."""
 SAME_VALUE = 1e-9
 """Values that differ by a smaller share of their range are equal [-]."""

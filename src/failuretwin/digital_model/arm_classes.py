@@ -41,6 +41,7 @@ class ArmClass(Bounded):
         tail_dof: Degrees of freedom of that scatter.
         lost: Share of movements in which one given motor misses its command [-].
         lost_together: The same of two given motors [-].
+        start_jitter_s: Deviation of when a motor starts about its own lag [s].
     """
 
     bias_rad: AtLeastZero
@@ -52,16 +53,18 @@ class ArmClass(Bounded):
     tail_dof: AtLeastZero
     lost: Share
     lost_together: Share
+    start_jitter_s: AtLeastZero
 
 
 ARM_CLASSES: Mapping[str, ArmClass] = {
-    "hobby servo": ArmClass(0.0065, 0.001, 0.015, 0.007, 0.005, 0.006, 5.0, 0.03, 0.005),
-    "industrial": ArmClass(0.003, 0.001, 0.001, 0.0003, 0.0003, 0.0004, 4.0, 0.003, 0.0003),
-    "cable-driven": ArmClass(0.02, 0.005, 0.02, 0.015, 0.01, 0.01, 4.0, 0.01, 0.001),
+    "hobby servo": ArmClass(0.0065, 0.001, 0.015, 0.007, 0.005, 0.006, 5.0, 0.03, 0.005, 0.05),
+    "industrial": ArmClass(0.003, 0.001, 0.001, 0.0003, 0.0003, 0.0004, 4.0, 0.003, 0.0003, 0.006),
+    "cable-driven": ArmClass(0.02, 0.005, 0.02, 0.015, 0.01, 0.01, 4.0, 0.01, 0.001, 0.05),
 }
 """Values by class. Hobby servos: rounded from published measurements (settled errors of half a
 degree to one degree, a twentieth of commands lost on a shared bus); industrial arms: makers'
-absolute accuracy of joints and repeatability; cable-driven: assumed, wide. The bias of hobby
+absolute accuracy of joints and repeatability; cable-driven: assumed, wide. Starts are assumed: a bus
+of servos against a controller with a fixed cycle. The bias of hobby
 servos, which is also the scatter between the calibrations of two of them, was chosen with diagnoses
 of one of these known (benchmarks/looks.md)."""
 LONG_ARM_M = 0.6

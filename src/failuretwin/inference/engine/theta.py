@@ -293,9 +293,8 @@ class ScaleFactors:
     jitter: Mapping[float, float]
 
 
-JITTER = {1.0: 0.4, 0.3: 0.3, 0.1: 0.3}
-"""Of all robots: controllers of industrial arms are far more punctual than servos on a bus;
-assumed."""
+JITTER = {1.0: 0.4, 0.4: 0.4, 2.5: 0.2}
+"""Factors on how unevenly motors start, and the share of robots of each; assumed."""
 AS_TOLD = ScaleFactors({1.0: 1.0}, {1.0: 1.0}, {1.0: 1.0})
 """Scatter and noise are known."""
 OF_CLASS = ScaleFactors(

@@ -19,6 +19,7 @@ import numpy as np
 from failuretwin.core.movements import Movements, Stretches
 from failuretwin.core.numerics import Covariance, log_sum
 from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray
+from failuretwin.digital_model.arm_classes import class_of
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
 from failuretwin.digital_model.settling import Settling, loads_in_range, poses_in_range
@@ -43,8 +44,6 @@ reach: links that differ from the drawing, and the sensor. Of two industrial arm
 HELD_PLAY_RAD = 0.003
 """What the gear of a held motor gives by under changing loads, 0.17 deg: it is not held better than
 its healthy neighbours scatter, however exact these are; assumed."""
-UNKNOWN_JITTER_S = 0.03
-"""Deviation of when a motor starts about its lag, where nobody has measured it [s]; assumed."""
 LAG_S, KNOWN_LAG_S = (0.03, 0.02), (0.015, 0.015)
 """Deviations of the lag of all motors together, with the clock, and of each of them, of a robot
 whose timing nobody has measured and of one that is calibrated [s]; assumed."""
@@ -272,7 +271,8 @@ class HealthyModel:
     @property
     def start_jitter_s(self) -> float:
         """Deviation of when a motor starts about its own lag [s]."""
-        return PUNCTUAL_SPREAD_S if self._timing_measured else UNKNOWN_JITTER_S
+        usual = class_of(self.twin.robot).start_jitter_s
+        return min(PUNCTUAL_SPREAD_S, usual) if self._timing_measured else usual
 
     @property
     def lag_deviations_s(self) -> tuple[float, float]:
