@@ -63,10 +63,10 @@ ARM_CLASSES: Mapping[str, ArmClass] = {
 }
 """Values by class. Hobby servos: rounded from published measurements (settled errors of half a
 degree to one degree, a twentieth of commands lost on a shared bus); industrial arms: makers'
-absolute accuracy of joints and repeatability; cable-driven: assumed, wide. Starts are assumed: a bus
-of servos against a controller with a fixed cycle. The bias of hobby
-servos, which is also the scatter between the calibrations of two of them, was chosen with diagnoses
-of one of these known (benchmarks/looks.md)."""
+absolute accuracy of joints and repeatability; cable-driven: assumed, wide. Starts are assumed: a
+bus of servos against a controller with a fixed cycle. The bias of hobby servos, which is also the
+scatter between the calibrations of two of them, and their starts were chosen with diagnoses of one
+of these known (benchmarks/looks.md)."""
 LONG_ARM_M = 0.6
 """Reach from which an arm without a stated class counts as industrial [m]."""
 
