@@ -158,7 +158,7 @@ def _live(
         monitor(known.twin, healthy, budget),
         lambda stack: connect(source, known.robot, live, seed, stack)[0],
         load_topics(live.topics).wait_s,
-        tuple(fault.partition("@")[0] for fault in live.faults),
+        tuple(one.partition("@")[0] for one in live.faults) if source == opt.EMULATED else None,
         source if is_network(source) else "",
         live.topics,
     )

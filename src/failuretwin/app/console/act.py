@@ -33,7 +33,7 @@ from failuretwin.inference.diagnoser import BayesDiagnoser
 
 LINES_S = 0.5
 """Time between two updates of a check [s]."""
-LONGEST_CHECK_S = 120.0
+SHORTEST_CHECK_S, LONGEST_CHECK_S = 5.0, 120.0
 BEAT = "<script>setInterval(() => window.socket?.connected && emitEvent('beat'), 1000)</script>"
 """Signs of a page that it works: its arm is stopped if they stay away."""
 SUFFIXES = (".nc", ".csv", ".mat", ".bag", ".mcap", ".db3", ".parquet")
@@ -55,24 +55,34 @@ def show_check(visit: Visit, name: str) -> None:
 
 
 class CheckPage:
-    """Starts a check of a robot, shows what happens, and stops it."""
+    """Starts a check of a robot, shows what happens, and stops it.
+
+    Only the arm of that name tells of it: that of its source, or the one emulated here. Any other
+    is an emulated arm of the kind, whose result is not stored.
+    """
 
     def __init__(self, visit: Visit, name: str) -> None:
         desk = visit.desk
         live = desk.live.get(name)
         place = live.settings.place if live is not None else ""
         self._visit, self._name = visit, name
-        self._known = (desk.robot(name) if name else None) or desk.known
+        known = desk.robot(name) if name else desk.known
+        if known is None:
+            draw.text(texts.NO_ROBOT)
+            return
+        self._known = known
         self._real = bool(place) and desk.move
+        self._own = self._real or (live is not None and live.settings.faults is not None)
+        kind = known.robot.name
+        self._title = name if self._own else texts.EMULATED.format(kind=kind)
         if name:
             ui.link(name, draw.link_to("robot", name=name))
         where = texts.REAL_ARM.format(place=place) if self._real else texts.EMULATED_ARM
-        draw.text(texts.CHECK_NOTE.format(place=where))
+        rehearsal = texts.REHEARSAL.format(kind=kind, name=name or texts.A_ROBOT)
+        draw.text(texts.CHECK_NOTE.format(place=where) if self._own else rehearsal)
         if place and not desk.move:
             draw.text(texts.NO_MOVE)
-        self._seconds = ui.number(texts.SECONDS, value=20, min=5, max=LONGEST_CHECK_S).classes(
-            "w-32"
-        )
+        self._seconds = ui.number(texts.SECONDS, value=20).classes("w-32")
         with ui.row().classes("gap-4 items-center"):
             if visit.session.may(MOVE):
                 draw.button(texts.START, self._start)
@@ -94,27 +104,31 @@ class CheckPage:
         self._beat_s = time.monotonic()
 
     def _start(self) -> None:
-        desk, known, name = self._visit.desk, self._known, self._name
+        desk, known, name, own = self._visit.desk, self._known, self._name, self._own
         if not self._visit.allows(MOVE):
             return
         if desk.check is not None and desk.check.running:
             ui.notify(texts.BUSY, type="negative")
             return
+        seconds = self._seconds.value
+        if seconds is None or not SHORTEST_CHECK_S <= seconds <= LONGEST_CHECK_S:
+            ends = {"low": SHORTEST_CHECK_S, "high": LONGEST_CHECK_S}
+            ui.notify(texts.SECONDS_RANGE.format(got=seconds, **ends), type="negative")
+            return
         self._beat()
         desk.check = CheckRun(
-            name or known.robot.name,
+            self._title,
             Checking(known, SafetyGate(known.robot)),
-            lambda stack: _arm(desk, known, name, self._real, stack),
+            lambda stack: _arm(desk, known, name if own else "", self._real, stack),
             beat_watch(lambda: desk.beat_s, lambda: self._beat_s),
-            lambda result: _keep(desk, known, name, result),
+            lambda result: _keep(desk, known, name if own else "", result),
         )
-        seconds = float(self._seconds.value or 20.0)
-        desk.check.start(min(max(seconds, 5.0), LONGEST_CHECK_S))
+        desk.check.start(float(seconds))
 
     def _update(self) -> None:
         check = self._visit.desk.check
         now: list[object] = [] if check is None else [*check.lines, check.result]
-        if check is None or now == self._shown:
+        if check is None or check.robot != self._title or now == self._shown:
             return
         self._shown = now
         self._lines.clear()
@@ -136,13 +150,13 @@ def _arm(desk: Desk, known: CalibratedRobot, name: str, real: bool, stack: ExitS
         return commander_of(
             ArmOptions(live.settings.place, (), True, live.settings.topics), known, 0, stack
         )
-    faults = live.settings.faults if live is not None else ()
-    emulation = emulation_with(faults, known_arm(known.robot), int(time.time()))
+    faults = live.settings.faults if live is not None else None
+    emulation = emulation_with(faults or (), known_arm(known.robot), int(time.time()))
     return stack.enter_context(EmulatedArm(emulation, Pace(desk.speed)))
 
 
 def _keep(desk: Desk, known: CalibratedRobot, name: str, result: CheckResult) -> None:
-    """Store the result of a check."""
+    """Store the result of a check; no name: it is nobody's."""
     record = desk.record(name, known)
     if record is not None:
         record.remember_check([result])

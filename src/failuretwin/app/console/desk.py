@@ -238,7 +238,7 @@ class Desk:
         """
         run = next((one for one in self.stored_runs(name) if one.row == row), None)
         known = self.robot(name)
-        if run is None or known is None or not Path(run.log).exists():
+        if run is None or known is None or not has_log(run):
             raise InputError(f"run {row} of {name!r}: its log is not on this computer.")
         return read_runs(run.log, known.robot).isel(run=[run.position]), known
 
@@ -275,6 +275,11 @@ class Desk:
             f"{motor}: {life.verdict}" if life else f"{motor}: fewer than {LEAST_RUNS} runs"
             for motor, life in lives.items()
         ]
+
+
+def has_log(run: StoredRun) -> bool:
+    """Return whether the log of a run is on this computer; a check has none."""
+    return bool(run.log) and Path(run.log).exists()
 
 
 @cache

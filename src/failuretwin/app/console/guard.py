@@ -119,7 +119,7 @@ class Guard:
         if path == "/stop":
             if session is None:
                 return 303, "", {"location": "/login"}
-            said = "" if body is None else self._stop(session.name or "/stop")
+            said = "" if body is None else self._stop(session.name or texts.THIS_COMPUTER)
             return 200, _stop_page(said), {}
         if path == "/logout" and body is not None:
             self._sessions.sign_out(token)

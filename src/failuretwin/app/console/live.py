@@ -59,7 +59,7 @@ class LiveSettings:
         monitor: The diagnoser.
         open_source: Opens its source on a stack.
         wait_s: Longest delay of commands [s].
-        faults: Faults of an emulated arm, which its emulated check has too.
+        faults: Faults of an arm emulated here, which its check has too; None: it is another arm.
         place: Network of the real arm; empty: emulated or a log.
         topics: File that names its topics; None: as usual.
     """
@@ -69,7 +69,7 @@ class LiveSettings:
     monitor: FaultMonitor
     open_source: Callable[[ExitStack], Source]
     wait_s: float = 0.0
-    faults: tuple[str, ...] = ()
+    faults: tuple[str, ...] | None = None
     place: str = ""
     topics: Path | None = None
 

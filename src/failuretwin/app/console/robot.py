@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from pathlib import Path
 
 from nicegui import ui
 
@@ -11,6 +10,7 @@ from failuretwin.app.console import draw, parts, texts
 from failuretwin.app.console import state as shown
 from failuretwin.app.console.arm import ArmScene
 from failuretwin.app.console.charts import Charts
+from failuretwin.app.console.desk import has_log
 from failuretwin.app.console.layout import Visit, page
 from failuretwin.app.console.live import LiveRobot
 from failuretwin.app.console.state import LiveView
@@ -87,7 +87,7 @@ def _runs(visit: Visit, name: str, robot: Robot | None) -> None:
     draw.heading(texts.RUNS)
 
     def link(words: str, page_name: str, one: StoredRun) -> draw.Cell:
-        if not Path(one.log).exists():
+        if not has_log(one):
             return texts.NO_LOG
         address = draw.link_to(page_name, name=name, run=one.row)
         return lambda: ui.link(words, address).props(f'aria-label="{words}: {one.row}"')

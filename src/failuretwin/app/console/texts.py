@@ -99,11 +99,16 @@ NO_OFFSETS = "No offsets are stored. `check` and `diagnose --track` store them."
 STORED = "stored"
 
 CHECK_NOTE = "Test movements on {place}, behind the same gates as `failuretwin check`."
-EMULATED_ARM, REAL_ARM = "an emulated arm", "the real arm at {place}"
+EMULATED_ARM, REAL_ARM = "this emulated arm", "the real arm at {place}"
+REHEARSAL = (
+    "Test movements on a healthy emulated {kind}: they say nothing of {name}, and are not stored."
+)
+A_ROBOT, EMULATED = "a robot", "an emulated {kind}"
+SECONDS_RANGE = "Seconds: got {got}, expected {low:g} to {high:g}."
 NO_MOVE = "The real arm is not moved: the server was started without --move."
 SECONDS, START, STOP = "Seconds", "Start the check", "STOP"
 STOP_NOTE = "No emergency stop: keep the real one in reach. It works from any window: /stop"
-STOPPED_BY = "stopped by {name}"
+STOPPED_BY, THIS_COMPUTER = "stopped by {name}", "somebody on this computer"
 STOP_SENT, NO_CHECK = "Told to stop.", "No check is running."
 HANG = "the console hangs"
 GONE = "the page that started the check is closed, or hangs"
