@@ -83,7 +83,7 @@ def begin(person, arm, seconds):
     person.write("Seconds", seconds)
     before = arm.hear()
     person.click("Start the check")
-    person.sees("the check of armpi_fpv has begun")
+    person.sees("armpi_fpv has begun")
     return before
 
 
