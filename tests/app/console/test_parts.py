@@ -2,14 +2,16 @@ from __future__ import annotations
 
 import time
 from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("nicegui")
 
-from failuretwin.app.console import act, live, state, texts, users
+from failuretwin.app.console import act, history, live, state, texts, users
 from failuretwin.app.console.checking import HANGS_S, Stoppable, beat_watch
+from failuretwin.app.console.desk import Desk
 from failuretwin.app.console.layout import Visit
 from failuretwin.app.console.live import LiveRobot, LiveSettings
 from failuretwin.connection.links.base import Order, Reading
@@ -106,16 +108,32 @@ def test_an_overview_of_the_store_and_a_repair_that_is_taken_back(armpi, tmp_pat
     (one,) = store.overview()
     assert (one.robot, one.kind, one.state) == ("arm", "armpi_fpv", "faulty")
     assert one.faults == {"motor_3:stuck": False}
+    assert history.suspected_motor(store.history("arm"), armpi.motor_names) == "motor_3"
     (run,) = store.runs("arm")
     assert (run.name, run.posterior, run.position) == ("run", dict(stuck.posterior), 0)
     store.found("arm", 1, "wrong")
     assert store.overview()[0].faults == {}
+    assert history.suspected_motor(store.history("arm"), armpi.motor_names) == "motor_1"
     store.repaired("arm", "motor_3", part="gear")
     assert len(store.history("arm").repairs) == 1
     store.withdraw_repair("arm", "motor_3", person="Ada")
     assert store.history("arm").repairs == ()
     with pytest.raises(InputError, match="no repair to withdraw"):
         store.withdraw_repair("arm", "motor_3")
+
+
+def test_a_field_that_may_not_be_empty_says_which_it_is():
+    assert history._filled(SimpleNamespace(value=" Ada "), texts.YOUR_NAME) == "Ada"
+    with pytest.raises(InputError, match="Fill in the field 'Your name' first"):
+        history._filled(SimpleNamespace(value=" "), texts.YOUR_NAME)
+
+
+def test_a_robot_whose_wear_is_not_tracked_has_a_sentence_for_people(armpi, tmp_path):
+    store = open_store(tmp_path / "robots.db", create=True)
+    store.remember([Diagnosis("run", {"healthy": 1.0})], "arm", profile=armpi)
+    desk = Desk(calibrated(armpi), store, None, {}, False, 1.0, tmp_path)
+    desk.look()
+    assert desk.remaining_life("arm") == [texts.NOT_TRACKED]
 
 
 def test_passwords_are_salted_and_files_of_users_are_checked(tmp_path):

@@ -260,7 +260,7 @@ class Desk:
         """Return the remaining life of each motor, in sentences.
 
         Raises:
-            InputError: If no run of the robot was followed.
+            InputError: If the store does not know the robot.
         """
         from failuretwin.decision.remaining_life import LEAST_RUNS, motor_lives
         from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -269,12 +269,13 @@ class Desk:
         record = None if known is None else self.record(name, known)
         if known is None or record is None:
             raise InputError("no store is open, or the robot is not known there.")
+        rows = record.store.tracked_rows(name)
+        if not rows:
+            return [texts.NOT_TRACKED]
         model = HealthyModel(known.twin, known.imperfections)
-        lives = motor_lives(record.tracked_rows(), model, np.random.default_rng(0))
-        return [
-            f"{motor}: {life.verdict}" if life else f"{motor}: fewer than {LEAST_RUNS} runs"
-            for motor, life in lives.items()
-        ]
+        lives = motor_lives(rows, model, np.random.default_rng(0))
+        few = texts.TOO_FEW.format(least=LEAST_RUNS)
+        return [f"{motor}: {life.verdict if life else few}" for motor, life in lives.items()]
 
 
 @cache
