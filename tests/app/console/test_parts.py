@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("nicegui")
 
-from failuretwin.app.console import act, history, live, state, texts, users
+from failuretwin.app.console import act, history, live, parts, state, texts, users
 from failuretwin.app.console.checking import HANGS_S, Stoppable, beat_watch
 from failuretwin.app.console.desk import Desk
 from failuretwin.app.console.layout import Visit
@@ -22,6 +22,7 @@ from failuretwin.data_knowledge.records.store import open_store
 from failuretwin.decision.acting.work import Halted
 from failuretwin.digital_model.calibrated_robot import calibrated
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
+from failuretwin.inference.advice import NOTHING_TO_DO
 
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
 
@@ -101,6 +102,32 @@ def test_only_the_suspected_motor_of_the_drawn_arm_differs(armpi):
     assert left[-1] == pytest.approx(np.linalg.norm(tool - arm.tool(command[None])[0][0]))
 
 
+HEALTHY = Diagnosis("", {"healthy": 1.0, "motor_3:stuck": 0.0})
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"days": 40.0}, ["silent since Monday", "Its last word is old"]),
+        ({"remarks": ("", DOUBT)}, ["Put the set-up right first", "the sense of motor 2 is wrong"]),
+        ({"faults": {"motor_3:stuck": True}}, ["'motor 3 stuck' is still open"]),
+    ],
+)
+def test_a_robot_that_needs_somebody_is_never_told_to_be_left_alone(armpi, given, said):
+    one = glance(**given)
+    tile = state.stored_tile(one, NOW)
+    lines = parts.step_lines(armpi, tile, "Monday", HEALTHY, list(one.faults))
+    assert all(words in " ".join(lines) for words in said)
+    assert NOTHING_TO_DO not in lines
+
+
+def test_a_healthy_robot_is_left_alone_and_an_alarm_that_its_run_shows_is_told_once(armpi):
+    stuck = Diagnosis("", {"healthy": 0.0, "motor_3:stuck": 1.0})
+    tile = state.stored_tile(glance(), NOW)
+    assert parts.step_lines(armpi, tile, "Monday", HEALTHY, []) == [NOTHING_TO_DO]
+    assert len(parts.step_lines(armpi, tile, "Monday", stuck, ["motor_3:stuck"])) == 1
+
+
 def test_an_overview_of_the_store_and_a_repair_that_is_taken_back(armpi, tmp_path):
     store = open_store(tmp_path / "robots.db", create=True)
     stuck = Diagnosis("run", {"healthy": 0.01, "motor_3:stuck": 0.99}, verdict="motor 3 stuck")
@@ -109,6 +136,10 @@ def test_an_overview_of_the_store_and_a_repair_that_is_taken_back(armpi, tmp_pat
     assert (one.robot, one.kind, one.state) == ("arm", "armpi_fpv", "faulty")
     assert one.faults == {"motor_3:stuck": False}
     assert history.suspected_motor(store.history("arm"), armpi.motor_names) == "motor_3"
+    desk = Desk(calibrated(armpi), store, None, {}, False, 1.0, tmp_path)
+    desk.look()
+    assert desk.open_faults("arm") == ["motor_3:stuck"]
+    assert desk.last_diagnosis("arm").posterior == stuck.posterior
     (run,) = store.runs("arm")
     assert (run.name, run.posterior, run.position) == ("run", dict(stuck.posterior), 0)
     store.found("arm", 1, "wrong")

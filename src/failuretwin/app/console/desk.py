@@ -22,6 +22,7 @@ from failuretwin.app.console.state import Tile, Trace
 from failuretwin.app.remembering import RobotRecord
 from failuretwin.connection.fleet.broker import Access, open_broker
 from failuretwin.core.errors import FailureTwinError, InputError
+from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.movements import find_movements
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.readers.read import read_runs
@@ -34,8 +35,6 @@ from failuretwin.inference.diagnoser import BayesDiagnoser
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from failuretwin.core.hypothesis import Diagnosis
 
 LOOK_S = 2.0
 """Time between two looks into the store [s]."""
@@ -221,6 +220,22 @@ class Desk:
         if self.store is None or name not in {one.robot for one in self._glances}:
             return ()
         return self.store.runs(name)
+
+    def last_diagnosis(self, name: str) -> Diagnosis | None:
+        """Return the last diagnosis of a robot in the store, without its evidence; None: none."""
+        glance, runs = self._glance(name), self.stored_runs(name)
+        if glance is None or not runs:
+            return None
+        undecided, *quality = glance.remarks or ("",)
+        return Diagnosis("", runs[0].posterior, quality=tuple(quality), undecided=undecided)
+
+    def open_faults(self, name: str) -> list[str]:
+        """Return the faults of the open episodes of a robot in the store, ``MOTOR:MODE``."""
+        glance = self._glance(name)
+        return [] if glance is None else list(glance.faults)
+
+    def _glance(self, name: str) -> RobotGlance | None:
+        return next((one for one in self._glances if one.robot == name), None)
 
     def stored_trace(self, name: str, row: int) -> Trace:
         """Return the motion of a run in the store, and its diagnosis by this version.

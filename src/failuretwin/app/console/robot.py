@@ -13,12 +13,10 @@ from failuretwin.app.console.arm import ArmScene
 from failuretwin.app.console.charts import Charts
 from failuretwin.app.console.layout import Visit, page
 from failuretwin.app.console.live import LiveRobot
-from failuretwin.app.console.state import LiveView
+from failuretwin.app.console.state import LiveView, Tile
 from failuretwin.core.foreign import printable
-from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.records.overview import StoredRun
 from failuretwin.decision.acting.reach import Reach, reach, workspace
-from failuretwin.decision.robot_state import robot_state
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 from failuretwin.digital_model.robot import Robot
@@ -51,7 +49,7 @@ def show(visit: Visit, name: str) -> None:
             draw.badges(tile.states)
             draw.text(visit.words(tile.said, robot))
             draw.text(visit.time(tile.heard)).classes("soft")
-            _stored_arm(visit, name, known)
+            _stored_arm(visit, tile, known)
         _runs(visit, name, robot)
         if known is not None:
             ReachPart(visit, known)
@@ -59,24 +57,23 @@ def show(visit: Visit, name: str) -> None:
         parts.asked(visit, robot, life, lambda: desk.remaining_life(name), texts.LIFE_NOTE)
 
 
-def _stored_arm(visit: Visit, name: str, known: CalibratedRobot | None) -> None:
-    """Draw the arm at rest, coloured by the last diagnosis, and what to do."""
-    runs = visit.desk.stored_runs(name)
+def _stored_arm(visit: Visit, tile: Tile, known: CalibratedRobot | None) -> None:
+    """Draw the arm at rest, coloured by the last diagnosis and open episodes, and what to do."""
     if known is None:
         draw.text(texts.NO_PROFILE)
         return
-    last = Diagnosis("", runs[0].posterior) if runs else None
+    last, alarms = visit.desk.last_diagnosis(tile.name), visit.desk.open_faults(tile.name)
     with ui.element("div").classes("columns"):
         with ui.element("section"):
             draw.heading(texts.ARM_AT_REST)
             pose = known.robot.resting_pose
             shares = shown.motor_shares(known.robot.motor_names, last)
+            shares |= {fault.partition(":")[0]: 1.0 for fault in alarms}
             ArmScene(known.robot, texts.ARM_AT_REST).show(pose, pose, shares)
         with ui.element("section"):
             if last is not None:
-                draw.heading(texts.NEXT)
-                draw.text(visit.words(robot_state([last], known.robot).step, known.robot))
-                parts.motor_table(known.robot, last)
+                parts.next_steps(visit, known.robot, tile, last, alarms)
+                parts.motor_table(known.robot, last, alarms)
 
 
 def _runs(visit: Visit, name: str, robot: Robot | None) -> None:
@@ -220,6 +217,8 @@ class LivePage:
             if view.diagnosis is not None:
                 trace = self._live.trace()
                 parts.reasons(self._visit, view.diagnosis, trace, robot, self._link)
+            if view.diagnosis is not None or tile.state == shown.STALE:
+                parts.next_steps(self._visit, robot, tile, view.diagnosis)
             draw.heading(texts.MOTORS)
             rows = [
                 [

@@ -57,12 +57,21 @@ WALL_TEXTS = {
     "signs": SIGNS,
 }
 
+SILENT = (
+    "This robot has been silent since {time}. Its last word is old: check that it is on and "
+    "connected, then record a run."
+)
+OPEN_ALARM = (
+    "The alarm {fault!r} is still open, though the last run does not show this fault. Look at "
+    "this motor too, then confirm or reject the episode on the history page."
+)
+OPEN_EPISODES = "Open episodes"
 VERDICT, SINCE, WHY, NEXT = "Verdict", "Since", "Why", "What to do now"
 ALARM_SINCE = "alarm number {number}, since {time}"
 MOTORS, MOTOR, STATE, PROBABILITY, SAYS = "Motors", "Motor", "State", "Fault probability", "Says"
 ARM = "Arm: solid where it is, transparent where it was told to be"
 VIEW, CORNER, FRONT, SIDE, ABOVE = "View", "Corner", "Front", "Side", "Above"
-ARM_AT_REST = "Arm at rest, its motors coloured by the last run"
+ARM_AT_REST = "Arm at rest, its motors coloured by the last run and by open episodes"
 ARM_NOTE = "The solid arm is drawn from the measured tool and the suspected motor."
 POSTERIOR, RESIDUALS = "Probability over time", "Residuals by motor [mm]"
 TOOL, TOOL_NOTE = "Tool path [mm]", "Solid: measured; dashed: commanded."
