@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("nicegui")
 
-from failuretwin.app.console import act, history, live, parts, state, texts, users
+from failuretwin.app.console import act, demo, history, live, parts, state, texts, users, wall
 from failuretwin.app.console.checking import HANGS_S, Stoppable, beat_watch
 from failuretwin.app.console.desk import Desk
 from failuretwin.app.console.layout import Visit
@@ -72,6 +72,20 @@ def test_an_arm_whose_fleet_doubts_its_set_up_is_shown_so():
     status = {"partitions": {"p1": {"at": 100.0, "robots": {"a": robot}}}}
     (tile,) = state.fleet_tiles(status, {}, 101.0)
     assert (tile.states, tile.said) == ((state.SET_UP,), DOUBT)
+
+
+def test_a_text_that_is_cut_ends_with_an_ellipsis():
+    assert state.shortened("whole", 5) == "whole"
+    assert state.shortened("cut in half", 5) == "cut…"
+
+
+def test_the_wall_is_told_that_it_is_loaded_even_if_there_is_no_robot():
+    shown = wall.Wall.__new__(wall.Wall)
+    shown._shown, sent = None, []
+    shown.run_method = lambda *told: sent.append(told)
+    for _ in range(2):
+        shown.show({})
+    assert sent == [("update", [], [])]
 
 
 def test_the_worst_robot_comes_first():
@@ -245,6 +259,13 @@ class Unheard:
 def watched(robot, open_source):
     known = calibrated(robot)
     return LiveRobot(LiveSettings("arm", known, Unheard(), open_source))
+
+
+def test_the_store_of_the_demo_knows_its_arms_at_work(armpi, tmp_path):
+    store = open_store(tmp_path / "robots.db", create=True)
+    for robot in demo.demo_arms(store, calibrated(armpi), 1.0).values():
+        robot._begin_keeping()
+    assert set(store.robots()) == set(demo.ARMS)
 
 
 def test_a_robot_whose_watch_fails_or_hangs_is_stale(armpi):

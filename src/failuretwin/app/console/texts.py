@@ -50,6 +50,7 @@ WALL_TEXTS = {
     "filters": {"kind": "Kind", "site": "Site", "mode": "Fault mode", "states": "State"},
     "all": "all",
     "none": "No robot matches.",
+    "loading": "Loading the robots ...",
     "heard": "heard",
     "shown": "of",
     "robots": "robots",
@@ -63,7 +64,7 @@ SILENT = (
 )
 OPEN_ALARM = (
     "The alarm {fault!r} is still open, though the last run does not show this fault. Look at "
-    "this motor too, then confirm or reject the episode on the history page."
+    "this motor too. Then confirm or reject the episode, or note its repair, on the history page."
 )
 OPEN_EPISODES = "Open episodes"
 VERDICT, SINCE, WHY, NEXT = "Verdict", "Since", "Why", "What to do now"
