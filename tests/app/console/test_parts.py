@@ -9,7 +9,18 @@ import pytest
 
 pytest.importorskip("nicegui")
 
-from failuretwin.app.console import act, demo, history, live, parts, state, texts, users, wall
+from failuretwin.app.console import (
+    act,
+    demo,
+    history,
+    live,
+    parts,
+    robot,
+    state,
+    texts,
+    users,
+    wall,
+)
 from failuretwin.app.console.checking import HANGS_S, Stoppable, beat_watch
 from failuretwin.app.console.desk import Desk
 from failuretwin.app.console.layout import Visit
@@ -263,8 +274,8 @@ def watched(robot, open_source):
 
 def test_the_store_of_the_demo_knows_its_arms_at_work(armpi, tmp_path):
     store = open_store(tmp_path / "robots.db", create=True)
-    for robot in demo.demo_arms(store, calibrated(armpi), 1.0).values():
-        robot._begin_keeping()
+    for arm in demo.demo_arms(store, calibrated(armpi), 1.0).values():
+        arm._begin_keeping()
     assert set(store.robots()) == set(demo.ARMS)
 
 
@@ -309,3 +320,21 @@ def test_an_angle_that_is_typed_is_meant_as_it_is_shown(armpi, unit):
     visit = Visit(None, None, "auto", unit, None)
     told = float(visit.angle(0.3, armpi, 2).split()[0])
     assert visit.held(told, armpi, 2) == pytest.approx(0.3, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("told", "said"), [(None, "Fill in the field"), (9999.0, "can stand from")]
+)
+def test_an_angle_where_no_motor_stands_is_refused(armpi, told, said):
+    visit = Visit(None, None, "auto", "deg", None)
+    with pytest.raises(InputError, match=said):
+        robot.held_angle(visit, armpi, "motor_3", told)
+    assert robot.held_angle(visit, armpi, "motor_3", 20.0) == pytest.approx(np.deg2rad(20.0))
+
+
+def test_the_reach_is_asked_for_the_suspected_motor_where_it_stands(armpi):
+    stuck = Diagnosis("", {"healthy": 0.01, "motor_3:stuck": 0.99})
+    said = "motor 3 stuck at -20 deg since 0.5 s, over 99.9 % sure"
+    assert robot.suspect_and_angle(armpi, stuck, said) == ("motor_3", np.deg2rad(-20.0))
+    assert robot.suspect_and_angle(armpi, stuck, "motor_3: stuck")[0] == "motor_3"
+    assert robot.suspect_and_angle(armpi, HEALTHY, "healthy") == ("", 0.0)

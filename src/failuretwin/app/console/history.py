@@ -43,6 +43,7 @@ class HistoryPage:
 
     def __init__(self, visit: Visit, name: str, store: Store) -> None:
         self._visit, self._name, self._store = visit, name, store
+        self._repaired = ""
         signed = visit.session.name
         with ui.row().classes("gap-4 items-end"):
             self._person = _field(texts.YOUR_NAME, signed)
@@ -145,13 +146,16 @@ class HistoryPage:
         draw.heading(texts.NOTE_REPAIR)
         names = known.robot.motor_names
         with ui.row().classes("gap-4 items-end"):
-            motor = draw.Choice(names, suspected_motor(history, names), texts.MOTOR)
+            motor = draw.Choice(
+                names, self._repaired or suspected_motor(history, names), texts.MOTOR
+            )
             part = _field(texts.PART)
 
             def work() -> None:
                 told, person = _filled(part, texts.PART), _filled(self._person, texts.YOUR_NAME)
                 note = _value(self._note)
                 self._store.repaired(self._name, motor.value, part=told, person=person, note=note)
+                self._repaired = motor.value  # stays chosen, so that it can be undone
 
             draw.button(texts.REPAIR, lambda: self._state(work))
 
