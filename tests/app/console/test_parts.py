@@ -279,6 +279,19 @@ def test_the_store_of_the_demo_knows_its_arms_at_work(armpi, tmp_path):
     assert set(store.robots()) == set(demo.ARMS)
 
 
+def test_the_end_of_a_watch_is_waited_for(armpi):
+    def slow(stack):
+        time.sleep(0.1)
+        raise InputError("no robot")
+
+    arm = watched(armpi, slow)
+    arm.wait(5.0)  # it was never begun
+    arm.start()
+    arm.stop()
+    arm.wait(5.0)
+    assert arm.tile.said.startswith("no robot; last word")
+
+
 def test_a_robot_whose_watch_fails_or_hangs_is_stale(armpi):
     def broken(stack):
         raise ZeroDivisionError("broken")

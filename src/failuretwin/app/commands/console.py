@@ -89,7 +89,8 @@ def console(
     with needs_extra("the console needs NiceGUI", "console"):
         import nicegui  # noqa: F401
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="failuretwin-")))
+        made = tempfile.TemporaryDirectory(prefix="failuretwin-", ignore_cleanup_errors=True)
+        folder = Path(stack.enter_context(made))
         stored, known = (None, robot.known) if memory.store is None else memory.look_up(robot)
         arms: dict[str, LiveRobot] = {}
         store = None if stored is None else stored.store

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 LOOK_S = 2.0
 """Time between two looks into the store [s]."""
+END_S = 1.0
+"""Time that each watch may take to store its last words at the end [s]."""
 STATUS_S = 1.0
 """Time between two looks at the fleet [s]."""
 
@@ -104,6 +106,8 @@ class Desk:
             robot.stop()
         if self.check is not None:
             self.check.stop("the console ends")
+        for robot in self.live.values():
+            robot.wait(END_S)
 
     # The wall.
 
