@@ -49,6 +49,7 @@ def serve(port: int, speed: float) -> None:
     from failuretwin.app.console.server import serve as serve_console
     from failuretwin.app.console.state import WORST_FIRST, Tile
     from failuretwin.app.console.users import Sessions
+    from failuretwin.data_knowledge.records.store import open_store
     from failuretwin.digital_model.calibrated_robot import load_calibration
 
     @dataclass
@@ -70,7 +71,8 @@ def serve(port: int, speed: float) -> None:
 
     known = load_calibration(None, "armpi_fpv")
     folder = Path(tempfile.mkdtemp())
-    desk = Many(known, None, None, demo_arms(known, speed), False, speed, folder)
+    arms = demo_arms(open_store(folder / "robots.db", create=True), known, speed)
+    desk = Many(known, None, None, arms, False, speed, folder)
     serve_console(desk, Listening("127.0.0.1", port, Sessions({})))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,6 +40,10 @@ def run(name, undecided="", nats=(), **chances):
     posterior["healthy"] = 1.0 - sum(posterior.values()) + posterior["healthy"]
     evidence = tuple(MovementEvidence(m, n) for m, n in enumerate(nats, 1))
     return Diagnosis(name, posterior, undecided=undecided, evidence=evidence)
+
+
+def faulty_run(name):
+    return run(name, motor_1__stuck=0.999)
 
 
 def test_runs_that_agree_are_never_surer_together_than_the_surest():
@@ -82,6 +87,18 @@ def test_a_zero_that_may_be_a_fault_of_every_run_is_no_healthy_robot():
     assert "+4.1 deviations off" in found.remark
     assert found.step.startswith("Look at the zero mark")
     assert robot_state([run("a")], ROBOT, learned=("most was learned",)).state.kind == HEALTHY_STATE
+
+
+def test_a_log_whose_set_up_is_uncertain_is_not_plainly_healthy():
+    doubt = (
+        "the log does not fit the profile (97.0 % sure): motor 2 turns the other way: reverse it"
+    )
+    healthy, faulty = (replace(one, quality=(doubt,)) for one in (run("a"), faulty_run("b")))
+    found = robot_state([healthy], ROBOT)
+    assert found.headline == "Healthy, but its set-up is uncertain"
+    assert found.step.startswith("Put the set-up right first")
+    assert found.step.endswith("reverse it.")
+    assert robot_state([faulty], ROBOT).step.endswith(robot_state([faulty_run("b")], ROBOT).step)
 
 
 def test_a_fault_that_began_is_told_by_the_runs_since_then():

@@ -33,6 +33,7 @@ from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.advice import (
     MOVEMENT,
+    NOTHING_TO_DO,
     next_steps,
     rests_on_one_movement,
     sureness,
@@ -42,6 +43,7 @@ from failuretwin.inference.explanation import (
     joint_names_in,
     percent,
     plain_name,
+    set_up_doubt,
     undecided_step,
 )
 from failuretwin.inference.faults.prior_odds import log_prior
@@ -63,6 +65,9 @@ ZERO_STEP = (
     "`failuretwin doctor LOG --out FILE` writes the zero down. If the zero was right before, this "
     "is a fault: stop and repair the motor."
 )
+
+SET_UP_HEADLINE = "Healthy, but its set-up is uncertain"
+SET_UP_STEP = "Put the set-up right first, and diagnose the same log again: {doubt}."
 
 
 @dataclass(frozen=True)
@@ -185,7 +190,9 @@ def robot_state(
         found = _of_course(course, robot)
     else:
         found = _one_by_one(diagnoses, states, decided, robot, learned is None)
-    found = _with_zero(found, [*(line for d in diagnoses for line in d.quality), *(learned or ())])
+    quality = [line for d in diagnoses for line in d.quality]
+    found = _with_zero(found, [*quality, *(learned or ())])
+    found = _with_set_up(found, set_up_doubt(quality)) if decided else found
     return replace(
         found,
         headline=joint_names_in(found.headline, robot),
@@ -211,6 +218,16 @@ def _with_zero(found: RobotState, lines: Sequence[str]) -> RobotState:
     remark = "; ".join(filter(None, (found.remark, remarks[-1])))
     headline = "Cannot tell yet; healthy, but for a zero that may be a fault"
     return replace(found, state=State(OPEN_STATE), headline=headline, step=ZERO_STEP, remark=remark)
+
+
+def _with_set_up(found: RobotState, doubt: str) -> RobotState:
+    """Return a state that says first that its set-up is uncertain, and why; empty: it is not."""
+    if not doubt:
+        return found
+    headline = SET_UP_HEADLINE if found.state.kind == HEALTHY_STATE else found.headline
+    told = [SET_UP_STEP.format(doubt=doubt), found.step]
+    step = " ".join(line for line in told if line != NOTHING_TO_DO)
+    return replace(found, headline=headline, step=step)
 
 
 def _no_verdict(diagnoses: Sequence[Diagnosis]) -> RobotState:

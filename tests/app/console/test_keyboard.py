@@ -86,7 +86,8 @@ def test_somebody_signs_in_finds_the_sick_robot_and_confirms(person):
 def test_the_moment_is_replayed(person):
     person.open(SICK)
     person.sees("Runs")
-    person.open("Replay: 2")
+    tuesday = person.find("//tr[td[normalize-space()='tuesday']]//a")
+    person.open(tuesday.get_attribute("aria-label"))
     person.sees("possible causes")
     person.find("//input[@type='range']")
     before = clock(person)

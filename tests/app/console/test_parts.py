@@ -2,14 +2,27 @@ from __future__ import annotations
 
 import time
 from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("nicegui")
 
-from failuretwin.app.console import act, live, state, texts, users
+from failuretwin.app.console import (
+    act,
+    demo,
+    history,
+    live,
+    parts,
+    robot,
+    state,
+    texts,
+    users,
+    wall,
+)
 from failuretwin.app.console.checking import HANGS_S, Stoppable, beat_watch
+from failuretwin.app.console.desk import Desk
 from failuretwin.app.console.layout import Visit
 from failuretwin.app.console.live import LiveRobot, LiveSettings
 from failuretwin.connection.links.base import Order, Reading
@@ -20,6 +33,7 @@ from failuretwin.data_knowledge.records.store import open_store
 from failuretwin.decision.acting.work import Halted
 from failuretwin.digital_model.calibrated_robot import calibrated
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
+from failuretwin.inference.advice import NOTHING_TO_DO
 
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
 
@@ -71,6 +85,20 @@ def test_an_arm_whose_fleet_doubts_its_set_up_is_shown_so():
     assert (tile.states, tile.said) == ((state.SET_UP,), DOUBT)
 
 
+def test_a_text_that_is_cut_ends_with_an_ellipsis():
+    assert state.shortened("whole", 5) == "whole"
+    assert state.shortened("cut in half", 5) == "cut…"
+
+
+def test_the_wall_is_told_that_it_is_loaded_even_if_there_is_no_robot():
+    shown = wall.Wall.__new__(wall.Wall)
+    shown._shown, sent = None, []
+    shown.run_method = lambda *told: sent.append(told)
+    for _ in range(2):
+        shown.show({})
+    assert sent == [("update", [], [])]
+
+
 def test_the_worst_robot_comes_first():
     tiles = [state.Tile(s, "", s, "", "", None) for s in reversed(state.WORST_FIRST)]
     assert [t.state for t in state.worst_first(tiles)] == list(state.WORST_FIRST)
@@ -99,6 +127,32 @@ def test_only_the_suspected_motor_of_the_drawn_arm_differs(armpi):
     assert left[-1] == pytest.approx(np.linalg.norm(tool - arm.tool(command[None])[0][0]))
 
 
+HEALTHY = Diagnosis("", {"healthy": 1.0, "motor_3:stuck": 0.0})
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"days": 40.0}, ["silent since Monday", "Its last word is old"]),
+        ({"remarks": ("", DOUBT)}, ["Put the set-up right first", "the sense of motor 2 is wrong"]),
+        ({"faults": {"motor_3:stuck": True}}, ["'motor 3 stuck' is still open"]),
+    ],
+)
+def test_a_robot_that_needs_somebody_is_never_told_to_be_left_alone(armpi, given, said):
+    one = glance(**given)
+    tile = state.stored_tile(one, NOW)
+    lines = parts.step_lines(armpi, tile, "Monday", HEALTHY, list(one.faults))
+    assert all(words in " ".join(lines) for words in said)
+    assert NOTHING_TO_DO not in lines
+
+
+def test_a_healthy_robot_is_left_alone_and_an_alarm_that_its_run_shows_is_told_once(armpi):
+    stuck = Diagnosis("", {"healthy": 0.0, "motor_3:stuck": 1.0})
+    tile = state.stored_tile(glance(), NOW)
+    assert parts.step_lines(armpi, tile, "Monday", HEALTHY, []) == [NOTHING_TO_DO]
+    assert len(parts.step_lines(armpi, tile, "Monday", stuck, ["motor_3:stuck"])) == 1
+
+
 def test_an_overview_of_the_store_and_a_repair_that_is_taken_back(armpi, tmp_path):
     store = open_store(tmp_path / "robots.db", create=True)
     stuck = Diagnosis("run", {"healthy": 0.01, "motor_3:stuck": 0.99}, verdict="motor 3 stuck")
@@ -106,16 +160,36 @@ def test_an_overview_of_the_store_and_a_repair_that_is_taken_back(armpi, tmp_pat
     (one,) = store.overview()
     assert (one.robot, one.kind, one.state) == ("arm", "armpi_fpv", "faulty")
     assert one.faults == {"motor_3:stuck": False}
+    assert history.suspected_motor(store.history("arm"), armpi.motor_names) == "motor_3"
+    desk = Desk(calibrated(armpi), store, None, {}, False, 1.0, tmp_path)
+    desk.look()
+    assert desk.open_faults("arm") == ["motor_3:stuck"]
+    assert desk.last_diagnosis("arm").posterior == stuck.posterior
     (run,) = store.runs("arm")
     assert (run.name, run.posterior, run.position) == ("run", dict(stuck.posterior), 0)
     store.found("arm", 1, "wrong")
     assert store.overview()[0].faults == {}
+    assert history.suspected_motor(store.history("arm"), armpi.motor_names) == "motor_1"
     store.repaired("arm", "motor_3", part="gear")
     assert len(store.history("arm").repairs) == 1
     store.withdraw_repair("arm", "motor_3", person="Ada")
     assert store.history("arm").repairs == ()
     with pytest.raises(InputError, match="no repair to withdraw"):
         store.withdraw_repair("arm", "motor_3")
+
+
+def test_a_field_that_may_not_be_empty_says_which_it_is():
+    assert history._filled(SimpleNamespace(value=" Ada "), texts.YOUR_NAME) == "Ada"
+    with pytest.raises(InputError, match="Fill in the field 'Your name' first"):
+        history._filled(SimpleNamespace(value=" "), texts.YOUR_NAME)
+
+
+def test_a_robot_whose_wear_is_not_tracked_has_a_sentence_for_people(armpi, tmp_path):
+    store = open_store(tmp_path / "robots.db", create=True)
+    store.remember([Diagnosis("run", {"healthy": 1.0})], "arm", profile=armpi)
+    desk = Desk(calibrated(armpi), store, None, {}, False, 1.0, tmp_path)
+    desk.look()
+    assert desk.remaining_life("arm") == [texts.NOT_TRACKED]
 
 
 def test_passwords_are_salted_and_files_of_users_are_checked(tmp_path):
@@ -198,6 +272,26 @@ def watched(robot, open_source):
     return LiveRobot(LiveSettings("arm", known, Unheard(), open_source))
 
 
+def test_the_store_of_the_demo_knows_its_arms_at_work(armpi, tmp_path):
+    store = open_store(tmp_path / "robots.db", create=True)
+    for arm in demo.demo_arms(store, calibrated(armpi), 1.0).values():
+        arm._begin_keeping()
+    assert set(store.robots()) == set(demo.ARMS)
+
+
+def test_the_end_of_a_watch_is_waited_for(armpi):
+    def slow(stack):
+        time.sleep(0.1)
+        raise InputError("no robot")
+
+    arm = watched(armpi, slow)
+    arm.wait(5.0)  # it was never begun
+    arm.start()
+    arm.stop()
+    arm.wait(5.0)
+    assert arm.tile.said.startswith("no robot; last word")
+
+
 def test_a_robot_whose_watch_fails_or_hangs_is_stale(armpi):
     def broken(stack):
         raise ZeroDivisionError("broken")
@@ -239,3 +333,21 @@ def test_an_angle_that_is_typed_is_meant_as_it_is_shown(armpi, unit):
     visit = Visit(None, None, "auto", unit, None)
     told = float(visit.angle(0.3, armpi, 2).split()[0])
     assert visit.held(told, armpi, 2) == pytest.approx(0.3, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("told", "said"), [(None, "Fill in the field"), (9999.0, "can stand from")]
+)
+def test_an_angle_where_no_motor_stands_is_refused(armpi, told, said):
+    visit = Visit(None, None, "auto", "deg", None)
+    with pytest.raises(InputError, match=said):
+        robot.held_angle(visit, armpi, "motor_3", told)
+    assert robot.held_angle(visit, armpi, "motor_3", 20.0) == pytest.approx(np.deg2rad(20.0))
+
+
+def test_the_reach_is_asked_for_the_suspected_motor_where_it_stands(armpi):
+    stuck = Diagnosis("", {"healthy": 0.01, "motor_3:stuck": 0.99})
+    said = "motor 3 stuck at -20 deg since 0.5 s, over 99.9 % sure"
+    assert robot.suspect_and_angle(armpi, stuck, said) == ("motor_3", np.deg2rad(-20.0))
+    assert robot.suspect_and_angle(armpi, stuck, "motor_3: stuck")[0] == "motor_3"
+    assert robot.suspect_and_angle(armpi, HEALTHY, "healthy") == ("", 0.0)

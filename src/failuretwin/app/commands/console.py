@@ -89,7 +89,8 @@ def console(
     with needs_extra("the console needs NiceGUI", "console"):
         import nicegui  # noqa: F401
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="failuretwin-")))
+        made = tempfile.TemporaryDirectory(prefix="failuretwin-", ignore_cleanup_errors=True)
+        folder = Path(stack.enter_context(made))
         stored, known = (None, robot.known) if memory.store is None else memory.look_up(robot)
         arms: dict[str, LiveRobot] = {}
         store = None if stored is None else stored.store
@@ -98,13 +99,13 @@ def console(
         if source is not None:
             name = memory.robot_name or known.robot.name
             arms[name] = _live(name, source, known, live, budget, robot.seed, stored)
-        from failuretwin.app.console.demo import LOGS
+        from failuretwin.app.console.demo import ARMS, LOGS
         from failuretwin.app.console.desk import Desk
         from failuretwin.app.console.server import Listening, serve
 
         reached = access.to(url) if url is not None else None
         speed = live.speed or 1.0
-        expected = len(LOGS) + demo_robots + bool(demo_robots) if demo else 0
+        expected = len(ARMS) + len(LOGS) + demo_robots + bool(demo_robots) if demo else 0
         desk = Desk(known, store, reached, arms, move, speed, folder, expected=expected)
         serve(desk, Listening(host, port, sessions))
 
@@ -124,7 +125,7 @@ def _begin_demo(
     if store is not None:
         raise InputError("--demo has a store of its own. Leave out --store.")
     store = demo.demo_store(folder, known)
-    arms |= demo.demo_arms(known, speed)
+    arms |= demo.demo_arms(store, known, speed)
     if robots:
         writer = demo.HistoryWriter(store, folder, known, robots)
         stack.callback(writer.stop)

@@ -33,6 +33,15 @@ VIEWS = {
 """Places of the camera, in reaches of the arm; the first is high: it shows arms that fold."""
 TURN_S = 0.5
 """Time in which the camera goes to another place [s]."""
+LIGHT, DARK = "#eef1f4", "#1d2429"
+"""Background on light and on dark pages."""
+DARKEN = (
+    "() => {if (!document.body.classList.contains('body--dark')) return;"
+    f"const shown = getElement(%d); shown.renderer.setClearColor('{DARK}');"
+    "for (const one of shown.scene.children)"
+    f"if (one.object_id === 'ground') one.material.color.set('{DARK}')}}"
+)
+"""Darkens the background of a scene, by its number, on dark pages: only the browser knows those."""
 REACHED, MISSED = [0.11, 0.43, 0.24], [0.7, 0.15, 0.12]
 
 
@@ -141,8 +150,9 @@ class ArmScene:
     def _load(self) -> None:
         reach = self._robot.reach
         with self._place:
-            scene = ui.scene(480, 380, grid=(2, 20), background_color="#eef1f4", fps=10)
+            scene = ui.scene(480, 380, grid=(2, 20), background_color=LIGHT, fps=10)
             scene.props(f'role="img" aria-label="{self._label}"').classes("full")
+            scene.on("init", js_handler=DARKEN % scene.id)
         self._arms = Arm(self._robot, scene, solid=True), Arm(self._robot, scene, solid=False)
         with scene:
             self._points = ui.scene.point_cloud(*self._cloud, point_size=0.012 * reach / 0.3)

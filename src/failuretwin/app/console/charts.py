@@ -22,6 +22,8 @@ MOST_LINES = 6
 """Hypotheses of the chart of probabilities."""
 INTERESTING = 0.01
 COLOURS = ("#2f7fd0", "#b3261e", "#1b8a4b", "#8a5a00", "#7a55b8", "#0f8a8a")
+LABEL, GRID = "#7d8790", "#7d879055"
+"""Colours of letters and of lines of the grid, on light and on dark pages."""
 
 Line = tuple[str, FloatArray, FloatArray]
 """Name, times [s] and values; NaN is a gap. The second line of a name is dashed."""
@@ -81,11 +83,13 @@ class Chart:
         draw.later(self._load)
 
     def _load(self) -> None:
-        axis: dict[str, Any] = {"type": "value", "scale": True}
+        grid = {"lineStyle": {"color": GRID}}
+        label = {"axisLabel": {"color": LABEL}, "splitLine": grid, "axisLine": grid}
+        axis: dict[str, Any] = {"type": "value", "scale": True, **label}
         options = {
             "animation": False,
             "color": COLOURS,
-            "legend": {"top": 0, "itemWidth": 14, "itemGap": 8, "textStyle": {"color": "#7d8790"}},
+            "legend": {"top": 0, "itemWidth": 14, "itemGap": 8, "textStyle": {"color": LABEL}},
             "grid": {"left": 45, "right": 15, "top": 50, "bottom": 25},
             "xAxis": {**axis, "min": "dataMin", "max": "dataMax"},
             "yAxis": {**axis, **self._axis},

@@ -22,6 +22,7 @@ from failuretwin.app.console.state import Tile, Trace
 from failuretwin.app.remembering import RobotRecord
 from failuretwin.connection.fleet.broker import Access, open_broker
 from failuretwin.core.errors import FailureTwinError, InputError
+from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.movements import find_movements
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.readers.read import read_runs
@@ -35,10 +36,10 @@ from failuretwin.inference.diagnoser import BayesDiagnoser
 if TYPE_CHECKING:
     import xarray as xr
 
-    from failuretwin.core.hypothesis import Diagnosis
-
 LOOK_S = 2.0
 """Time between two looks into the store [s]."""
+END_S = 1.0
+"""Time that each watch may take to store its last words at the end [s]."""
 STATUS_S = 1.0
 """Time between two looks at the fleet [s]."""
 
@@ -105,6 +106,8 @@ class Desk:
             robot.stop()
         if self.check is not None:
             self.check.stop("the console ends")
+        for robot in self.live.values():
+            robot.wait(END_S)
 
     # The wall.
 
@@ -222,6 +225,22 @@ class Desk:
             return ()
         return self.store.runs(name)
 
+    def last_diagnosis(self, name: str) -> Diagnosis | None:
+        """Return the last diagnosis of a robot in the store, without its evidence; None: none."""
+        glance, runs = self._glance(name), self.stored_runs(name)
+        if glance is None or not runs:
+            return None
+        undecided, *quality = glance.remarks or ("",)
+        return Diagnosis("", runs[0].posterior, quality=tuple(quality), undecided=undecided)
+
+    def open_faults(self, name: str) -> list[str]:
+        """Return the faults of the open episodes of a robot in the store, ``MOTOR:MODE``."""
+        glance = self._glance(name)
+        return [] if glance is None else list(glance.faults)
+
+    def _glance(self, name: str) -> RobotGlance | None:
+        return next((one for one in self._glances if one.robot == name), None)
+
     def stored_trace(self, name: str, row: int) -> Trace:
         """Return the motion of a run in the store, and its diagnosis by this version.
 
@@ -260,7 +279,7 @@ class Desk:
         """Return the remaining life of each motor, in sentences.
 
         Raises:
-            InputError: If no run of the robot was followed.
+            InputError: If the store does not know the robot.
         """
         from failuretwin.decision.remaining_life import LEAST_RUNS, motor_lives
         from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -269,12 +288,13 @@ class Desk:
         record = None if known is None else self.record(name, known)
         if known is None or record is None:
             raise InputError("no store is open, or the robot is not known there.")
+        rows = record.store.tracked_rows(name)
+        if not rows:
+            return [texts.NOT_TRACKED]
         model = HealthyModel(known.twin, known.imperfections)
-        lives = motor_lives(record.tracked_rows(), model, np.random.default_rng(0))
-        return [
-            f"{motor}: {life.verdict}" if life else f"{motor}: fewer than {LEAST_RUNS} runs"
-            for motor, life in lives.items()
-        ]
+        lives = motor_lives(rows, model, np.random.default_rng(0))
+        few = texts.TOO_FEW.format(least=LEAST_RUNS)
+        return [f"{motor}: {life.verdict if life else few}" for motor, life in lives.items()]
 
 
 def has_log(run: StoredRun) -> bool:

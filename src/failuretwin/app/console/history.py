@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from nicegui import ui
@@ -11,6 +11,7 @@ from failuretwin.app.console import draw, texts
 from failuretwin.app.console.layout import Visit, page
 from failuretwin.app.console.users import CONFIRM
 from failuretwin.connection.fault_rates import LearnedRates
+from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.records.episodes import CONFIRMED
 from failuretwin.data_knowledge.records.history import (
@@ -42,6 +43,7 @@ class HistoryPage:
 
     def __init__(self, visit: Visit, name: str, store: Store) -> None:
         self._visit, self._name, self._store = visit, name, store
+        self._repaired = ""
         signed = visit.session.name
         with ui.row().classes("gap-4 items-end"):
             self._person = _field(texts.YOUR_NAME, signed)
@@ -57,7 +59,7 @@ class HistoryPage:
         with self._body:
             draw.text(history.health_by(self._visit.day))
             self._episodes(history)
-            self._repair()
+            self._repair(history)
             self._rates(history.kind)
             _timeline(self._visit, history)
             _compare(self._visit, history)
@@ -87,12 +89,12 @@ class HistoryPage:
             episode.number,
             verdict,
             cause=_value(self._cause),
-            person=_value(self._person),
+            person=_filled(self._person, texts.YOUR_NAME),
             note=_value(self._note),
         )
 
     def _withdraw(self, episode: FaultEpisode) -> None:
-        person, note = _value(self._person), _value(self._note)
+        person, note = _filled(self._person, texts.YOUR_NAME), _value(self._note)
         self._store.withdraw(self._name, episode.number, person=person, note=note)
 
     def _episodes(self, history: History) -> None:
@@ -137,26 +139,28 @@ class HistoryPage:
         made = draw.button(words, lambda: self._state(work)).props("outline")
         made.props(f'aria-label="{words}: {texts.EPISODE.lower()} {episode.number}"')
 
-    def _repair(self) -> None:
+    def _repair(self, history: History) -> None:
         known = self._visit.desk.robot(self._name)
         if known is None or not self._visit.confirms:
             return
         draw.heading(texts.NOTE_REPAIR)
         names = known.robot.motor_names
         with ui.row().classes("gap-4 items-end"):
-            motor = draw.Choice(names, names[0], texts.MOTOR)
+            motor = draw.Choice(
+                names, self._repaired or suspected_motor(history, names), texts.MOTOR
+            )
             part = _field(texts.PART)
 
             def work() -> None:
-                person, note = _value(self._person), _value(self._note)
-                self._store.repaired(
-                    self._name, motor.value, part=_value(part), person=person, note=note
-                )
+                told, person = _filled(part, texts.PART), _filled(self._person, texts.YOUR_NAME)
+                note = _value(self._note)
+                self._store.repaired(self._name, motor.value, part=told, person=person, note=note)
+                self._repaired = motor.value  # stays chosen, so that it can be undone
 
             draw.button(texts.REPAIR, lambda: self._state(work))
 
             def undo() -> None:
-                person = _value(self._person)
+                person = _filled(self._person, texts.YOUR_NAME)
                 self._store.withdraw_repair(self._name, motor.value, person=person)
 
             draw.button(texts.UNDO_REPAIR, lambda: self._state(undo))
@@ -180,6 +184,24 @@ def _field(label: str, value: str = "") -> ui.input:
 
 def _value(field: ui.input) -> str:
     return str(field.value or "").strip()[:LONGEST]
+
+
+def _filled(field: ui.input, label: str) -> str:
+    """Return the value of a field that may not be empty.
+
+    Raises:
+        InputError: If it is empty.
+    """
+    value = _value(field)
+    if not value:
+        raise InputError(texts.FILL_IN.format(label=label))
+    return value
+
+
+def suspected_motor(history: History, motors: Sequence[str]) -> str:
+    """Return the motor of the newest open episode that nobody refuted, else the first motor."""
+    open_ones = [one.motor for one in history.episodes if one.until is None and not one.refuted]
+    return next((motor for motor in reversed(open_ones) if motor in motors), motors[0])
 
 
 def _timeline(visit: Visit, history: History) -> None:

@@ -62,6 +62,7 @@ table.plain th, table.plain td { text-align: left; padding: .25rem .6rem; vertic
 .columns > * { min-width: 0; }
 .full { width: 100%; height: 100%; }
 .scene { height: 24rem; background: #eef1f4; }
+body.body--dark .scene { background: #1d2429; }
 .short { width: 7rem; }
 .chart { height: 14rem; }
 .reason { text-align: left; white-space: normal; }

@@ -114,6 +114,11 @@ class LiveRobot(Sink):
         """End the watch."""
         self._stopped.set()
 
+    def wait(self, longest_s: float) -> None:
+        """Wait until the watch has ended, and so what it keeps is stored."""
+        if self._thread.is_alive():
+            self._thread.join(longest_s)
+
     @property
     def tile(self) -> Tile:
         """The robot on the wall; it is stale if its watch hangs."""

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from nicegui import run, ui
 
 from failuretwin.app.console import draw, texts
 from failuretwin.app.console import state as shown
 from failuretwin.app.console.layout import Visit
-from failuretwin.app.console.state import Trace
+from failuretwin.app.console.state import Tile, Trace
 from failuretwin.core.errors import FailureTwinError
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.robot_state import robot_state
+from failuretwin.decision.robot_state import SET_UP_STEP, robot_state
 from failuretwin.digital_model.robot import Robot
-from failuretwin.inference.advice import STEP
-from failuretwin.inference.explanation import percent
+from failuretwin.inference.advice import NOTHING_TO_DO, STEP
+from failuretwin.inference.explanation import joint_names_in, percent, plain_name
 
 MOVEMENT = re.compile(r"movement (\d+)\b")
 """Begin of a reason that a movement gives."""
@@ -30,7 +31,7 @@ def reasons(
     robot: Robot,
     movement: Callable[[str, float], object],
 ) -> None:
-    """Draw why, and what to do now; `movement` draws a reason that leads to its time [s]."""
+    """Draw why; `movement` draws a reason that leads to its time [s]."""
     draw.heading(texts.WHY)
     starts = dict(enumerate(trace.movements.tolist(), start=trace.first))
     for line in diagnosis.explanation:
@@ -40,16 +41,59 @@ def reasons(
             movement(visit.words(line, robot), at)
         elif not line.startswith(STEP):
             draw.text(visit.words(line, robot))
+
+
+def next_steps(
+    visit: Visit, robot: Robot, tile: Tile, diagnosis: Diagnosis | None, alarms: Sequence[str] = ()
+) -> None:
+    """Draw what to do now about a robot: its silence and open alarms first; see `step_lines`."""
     draw.heading(texts.NEXT)
-    draw.text(visit.words(robot_state([diagnosis], robot).step, robot))
+    for line in step_lines(robot, tile, visit.time(tile.heard), diagnosis, alarms):
+        draw.text(visit.words(line, robot))
 
 
-def motor_table(robot: Robot, diagnosis: Diagnosis) -> None:
-    """Draw the probability of a fault of each motor."""
+def step_lines(
+    robot: Robot, tile: Tile, heard: str, diagnosis: Diagnosis | None, alarms: Sequence[str]
+) -> list[str]:
+    """Return what to do now, a line each.
+
+    Args:
+        robot: The robot.
+        tile: It on the wall.
+        heard: When it was last heard, in words.
+        diagnosis: Its last diagnosis; None: none.
+        alarms: Faults of its open episodes, ``MOTOR:MODE``.
+    """
+    lines = [texts.SILENT.format(time=heard)] if tile.state == shown.STALE else []
+    if diagnosis is None:
+        return lines
+    if diagnosis.undecided and tile.set_up:
+        return [*lines, SET_UP_STEP.format(doubt=tile.set_up)]
+    doubted = replace(diagnosis, quality=(*diagnosis.quality, tile.set_up))
+    found = robot_state([doubted], robot)
+    for fault in unseen_alarms(alarms, found.state.motors):
+        words = plain_name(Hypothesis.parse(fault))
+        lines.append(joint_names_in(texts.OPEN_ALARM.format(fault=words), robot))
+    return lines if lines and found.step == NOTHING_TO_DO else [*lines, found.step]
+
+
+def unseen_alarms(alarms: Sequence[str], motors: Sequence[str]) -> list[str]:
+    """Return the faults of open episodes whose motor is none of those that a run shows."""
+    return [one for one in alarms if Hypothesis.parse(one).faults[0].motor not in motors]
+
+
+def motor_table(robot: Robot, diagnosis: Diagnosis, alarms: Sequence[str] | None = None) -> None:
+    """Draw the probability of a fault of each motor, and its open episodes if they are given."""
     draw.heading(texts.MOTORS)
     shares = shown.motor_shares(robot.motor_names, diagnosis)
     rows = [[motor, percent(share)] for motor, share in shares.items()]
-    draw.table((texts.MOTOR, texts.PROBABILITY), rows)
+    heads: tuple[str, ...] = (texts.MOTOR, texts.PROBABILITY)
+    if alarms is not None:
+        heads = (*heads, texts.OPEN_EPISODES)
+        faults = [fault for one in alarms for fault in Hypothesis.parse(one).faults]
+        for row in rows:
+            row.append(", ".join(fault.mode for fault in faults if fault.motor == row[0]))
+    draw.table(heads, rows)
 
 
 def asked(

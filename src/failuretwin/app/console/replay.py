@@ -12,6 +12,7 @@ from failuretwin.app.console.charts import Charts
 from failuretwin.app.console.layout import Visit, page
 from failuretwin.app.console.state import Trace
 from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.decision.robot_state import robot_state
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 
@@ -62,6 +63,8 @@ class Replay:
                     draw.heading(texts.VERDICT)
                     draw.text(visit.words(diagnosis.verdict, known.robot))
                     parts.reasons(visit, diagnosis, trace, known.robot, self._button)
+                    draw.heading(texts.NEXT)
+                    draw.text(visit.words(robot_state([diagnosis], known.robot).step, known.robot))
                     parts.motor_table(known.robot, diagnosis)
                 blind = texts.BLIND, texts.ASK_BLIND
                 parts.asked(visit, known.robot, blind, lambda: visit.desk.blind_spots(trace, known))

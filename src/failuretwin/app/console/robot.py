@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from datetime import UTC, datetime
 
+import numpy as np
 from nicegui import ui
 
 from failuretwin.app.console import draw, parts, texts
@@ -13,12 +15,12 @@ from failuretwin.app.console.charts import Charts
 from failuretwin.app.console.desk import has_log
 from failuretwin.app.console.layout import Visit, page
 from failuretwin.app.console.live import LiveRobot
-from failuretwin.app.console.state import LiveView
+from failuretwin.app.console.state import LiveView, Tile
+from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import printable
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.records.overview import StoredRun
 from failuretwin.decision.acting.reach import Reach, reach, workspace
-from failuretwin.decision.robot_state import robot_state
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 from failuretwin.digital_model.robot import Robot
@@ -28,6 +30,10 @@ FRAME_S, CHART_S = 0.1, 1.0
 """Time between two pictures of the arm, and of the charts [s]."""
 CHARTED_S = 60.0
 """Time that live charts show [s]."""
+ROUNDED = 0.01
+"""Angles beyond the travel of a motor that are still taken, since ends are rounded [rad, m]."""
+STUCK_AT = r"[+-]?\d+(?:\.\d+)?"
+"""Angle of a stuck motor in a verdict [deg]."""
 REACH_POINTS = 150
 """Points of the workspace that are tried."""
 
@@ -51,32 +57,31 @@ def show(visit: Visit, name: str) -> None:
             draw.badges(tile.states)
             draw.text(visit.words(tile.said, robot))
             draw.text(visit.time(tile.heard)).classes("soft")
-            _stored_arm(visit, name, known)
+            _stored_arm(visit, tile, known)
         _runs(visit, name, robot)
         if known is not None:
-            ReachPart(visit, known)
+            ReachPart(visit, known, *_held_now(visit, name, known.robot))
         life = texts.LIFE, texts.ASK_LIFE
         parts.asked(visit, robot, life, lambda: desk.remaining_life(name), texts.LIFE_NOTE)
 
 
-def _stored_arm(visit: Visit, name: str, known: CalibratedRobot | None) -> None:
-    """Draw the arm at rest, coloured by the last diagnosis, and what to do."""
-    runs = visit.desk.stored_runs(name)
+def _stored_arm(visit: Visit, tile: Tile, known: CalibratedRobot | None) -> None:
+    """Draw the arm at rest, coloured by the last diagnosis and open episodes, and what to do."""
     if known is None:
         draw.text(texts.NO_PROFILE)
         return
-    last = Diagnosis("", runs[0].posterior) if runs else None
+    last, alarms = visit.desk.last_diagnosis(tile.name), visit.desk.open_faults(tile.name)
     with ui.element("div").classes("columns"):
         with ui.element("section"):
             draw.heading(texts.ARM_AT_REST)
             pose = known.robot.resting_pose
             shares = shown.motor_shares(known.robot.motor_names, last)
+            shares |= {fault.partition(":")[0]: 1.0 for fault in alarms}
             ArmScene(known.robot, texts.ARM_AT_REST).show(pose, pose, shares)
         with ui.element("section"):
             if last is not None:
-                draw.heading(texts.NEXT)
-                draw.text(visit.words(robot_state([last], known.robot).step, known.robot))
-                parts.motor_table(known.robot, last)
+                parts.next_steps(visit, known.robot, tile, last, alarms)
+                parts.motor_table(known.robot, last, alarms)
 
 
 def _runs(visit: Visit, name: str, robot: Robot | None) -> None:
@@ -108,32 +113,30 @@ def _runs(visit: Visit, name: str, robot: Robot | None) -> None:
 class ReachPart:
     """What the arm can still reach if a motor is held, as a share and as points in a scene."""
 
-    def __init__(self, visit: Visit, known: CalibratedRobot) -> None:
+    def __init__(self, visit: Visit, known: CalibratedRobot, motor: str, angle: float) -> None:
         self._visit, self._known = visit, known
         self._scene: ArmScene | None = None
         draw.heading(texts.REACH)
         with ui.row().classes("items-end gap-4"):
-            self._motor = draw.Choice(["", *known.robot.motor_names], "", texts.MOTOR)
+            motors = known.robot.motor_names
+            self._motor = draw.Choice(["", *motors], motor, texts.MOTOR)
             words = texts.ANGLE.format(unit=visit.unit_of(known.robot))
-            start = visit.angle(0.0, known.robot, 0).split()[0]
+            at = motors.index(motor) if motor else 0
+            start = visit.angle(angle, known.robot, at).split()[0]
             self._angle = ui.number(words, value=float(start)).classes("short")
             draw.button(texts.ASK_REACH, self._ask)
         self._line = draw.text("").props('role="status"')
         self._place = ui.element("div")
 
     async def _ask(self) -> None:
-        robot, motor = self._known.robot, self._motor.value
-        held = None
-        if motor in robot.motor_names:
-            at = robot.motor_names.index(motor)
-            held = motor, self._visit.held(float(self._angle.value or 0.0), robot, at)
-        found = await draw.worked(_reach, self._known, held)
+        robot, told = self._known.robot, (self._motor.value, self._angle.value)
+        found = await draw.worked(_reach, self._visit, self._known, *told)
         if found is None:
             return
         said = texts.ALL_REACHED.format(share=found.share)
-        if held is not None:
-            told = self._visit.angle(held[1], robot, robot.motor_names.index(motor))
-            said = texts.REACHED.format(share=found.share, motor=motor, angle=told)
+        if found.motor:
+            words = self._visit.angle(found.angle, robot, robot.motor_names.index(found.motor))
+            said = texts.REACHED.format(share=found.share, motor=found.motor, angle=words)
         self._line.set_text(said)
         if self._scene is None:
             with self._place:
@@ -142,8 +145,51 @@ class ReachPart:
         self._scene.points(found.points, found.reached)
 
 
-def _reach(known: CalibratedRobot, held: tuple[str, float] | None) -> Reach:
+def _reach(visit: Visit, known: CalibratedRobot, motor: str, told: float | None) -> Reach:
+    held = (motor, held_angle(visit, known.robot, motor, told)) if motor else None
     return reach(known.robot, workspace(known.robot, REACH_POINTS), held)
+
+
+def held_angle(visit: Visit, robot: Robot, motor: str, told: float | None) -> float:
+    """Return the angle [rad] or place [m] that somebody filled in, in the unit of the reader.
+
+    Raises:
+        InputError: If it is empty, or the motor cannot stand there.
+    """
+    if told is None:
+        label = texts.ANGLE.format(unit=visit.unit_of(robot))
+        raise InputError(texts.FILL_IN.format(label=label))
+    at = robot.motor_names.index(motor)
+    angle, (low, high) = visit.held(float(told), robot, at), robot.travel[at].tolist()
+    if not low - ROUNDED <= angle <= high + ROUNDED:
+        ends = (visit.angle(end, robot, at) for end in (low, high))
+        raise InputError(texts.OUT_OF_RANGE.format(motor=motor, low=next(ends), high=next(ends)))
+    return angle
+
+
+def _held_now(visit: Visit, name: str, robot: Robot) -> tuple[str, float]:
+    """Return the motor that is suspected most, empty: none, and where it stands [rad]."""
+    desk = visit.desk
+    live, runs = desk.live.get(name), desk.stored_runs(name)
+    diagnosis = desk.last_diagnosis(name) if live is None else live.view.diagnosis
+    said = live.tile.said if live is not None else runs[0].verdict if runs else ""
+    return suspect_and_angle(robot, diagnosis, said)
+
+
+def suspect_and_angle(robot: Robot, diagnosis: Diagnosis | None, said: str) -> tuple[str, float]:
+    """Return the motor that is suspected most, and where a verdict says that it stands [rad].
+
+    No motor is an empty name; an angle that the verdict does not tell is that at rest.
+    """
+    shares = shown.motor_shares(robot.motor_names, diagnosis)
+    motor = max(shares, key=lambda one: shares[one])
+    if shares[motor] < shown.SUSPECT:
+        return "", 0.0
+    found = re.search(
+        rf"{motor.replace('_', ' ')}\b(?: \([^)]*\))? stuck at ({STUCK_AT}) deg", said
+    )
+    at = robot.motor_names.index(motor)
+    return motor, float(np.deg2rad(float(found[1])) if found else robot.resting_pose[at])
 
 
 class LivePage:
@@ -220,6 +266,8 @@ class LivePage:
             if view.diagnosis is not None:
                 trace = self._live.trace()
                 parts.reasons(self._visit, view.diagnosis, trace, robot, self._link)
+            if view.diagnosis is not None or tile.state == shown.STALE:
+                parts.next_steps(self._visit, robot, tile, view.diagnosis)
             draw.heading(texts.MOTORS)
             rows = [
                 [

@@ -28,6 +28,11 @@ LONGEST_TEXT = 300
 """Length to which texts from logs are cut [letters]."""
 
 
+def shortened(text: str, most: int) -> str:
+    """Return a text of so many letters at most; one that is cut ends with an ellipsis."""
+    return text if len(text) <= most else f"{text[: most - 1].rstrip()}…"
+
+
 @dataclass(frozen=True)
 class Tile:
     """A robot on the wall.
@@ -80,7 +85,7 @@ class Tile:
             "states": self.states,
             "rank": WORST_FIRST.index(self.state),
             "mode": self.mode,
-            "said": printable(self.said)[:LONGEST_TEXT],
+            "said": shortened(printable(self.said), LONGEST_TEXT),
             "heard": self.heard.timestamp() * 1000.0 if self.heard else None,
         }
 

@@ -50,6 +50,7 @@ WALL_TEXTS = {
     "filters": {"kind": "Kind", "site": "Site", "mode": "Fault mode", "states": "State"},
     "all": "all",
     "none": "No robot matches.",
+    "loading": "Loading the robots ...",
     "heard": "heard",
     "shown": "of",
     "robots": "robots",
@@ -57,12 +58,21 @@ WALL_TEXTS = {
     "signs": SIGNS,
 }
 
+SILENT = (
+    "This robot has been silent since {time}. Its last word is old: check that it is on and "
+    "connected, then record a run."
+)
+OPEN_ALARM = (
+    "The alarm {fault!r} is still open, though the last run does not show this fault. Look at "
+    "this motor too. Then confirm or reject the episode, or note its repair, on the history page."
+)
+OPEN_EPISODES = "Open episodes"
 VERDICT, SINCE, WHY, NEXT = "Verdict", "Since", "Why", "What to do now"
 ALARM_SINCE = "alarm number {number}, since {time}"
 MOTORS, MOTOR, STATE, PROBABILITY, SAYS = "Motors", "Motor", "State", "Fault probability", "Says"
 ARM = "Arm: solid where it is, transparent where it was told to be"
 VIEW, CORNER, FRONT, SIDE, ABOVE = "View", "Corner", "Front", "Side", "Above"
-ARM_AT_REST = "Arm at rest, its motors coloured by the last run"
+ARM_AT_REST = "Arm at rest, its motors coloured by the last run and by open episodes"
 ARM_NOTE = "The solid arm is drawn from the measured tool and the suspected motor."
 POSTERIOR, RESIDUALS = "Probability over time", "Residuals by motor [mm]"
 TOOL, TOOL_NOTE = "Tool path [mm]", "Solid: measured; dashed: commanded."
@@ -71,9 +81,15 @@ TOTAL = "tool error"
 ANGLES, TOLD, DRAWN = "Angles", "Told", "Drawn"
 BLIND, ASK_BLIND = "What the motion could not show", "Work it out"
 REACH, ASK_REACH, ANGLE = "What it can still reach", "Show", "Held at [{unit}]"
+OUT_OF_RANGE = "{motor} can stand from {low} to {high}. Fill in an angle between them."
 REACHED = "{share:.0%} of the usual workspace with {motor} held at {angle}"
 ALL_REACHED = "{share:.0%} of the usual workspace"
 LIFE, ASK_LIFE = "Remaining life", "Estimate"
+TOO_FEW = "too few runs to tell: fewer than {least} say something about its wear"
+NOT_TRACKED = (
+    "Cannot tell: the wear of this robot has not been tracked yet. Diagnose its logs with "
+    "`failuretwin diagnose LOG --track` and this store."
+)
 LIFE_NOTE = "How real arms wear is not known; shapes and limit are assumed."
 CHANGES, REPLAY_LIVE = "What changed", "Replay the last minutes"
 READ_AT = "reading of {time}"
@@ -89,6 +105,7 @@ PAUSE = "Pause"
 EPISODES, EPISODE, FAULT, FINDING = "Fault episodes", "Episode", "Fault", "Finding"
 TIMELINE, EVENT = "Timeline", "Event"
 YOUR_NAME, NOTE, CAUSE, PART = "Your name", "Note", "Cause", "Part"
+FILL_IN = "Fill in the field {label!r} first."
 CONFIRM, REJECT, OTHER, UNDO = "Confirm", "Reject", "Other cause", "Undo"
 NOTE_REPAIR, REPAIR, UNDO_REPAIR = "Note a repair", "Repair", "Undo its last repair"
 RATES = "Learned rates of faults"

@@ -10,9 +10,9 @@ export default {
             <option v-for="value in values(key)" :key="value" :value="value">
               {{ key === 'states' ? words.states[value] : value }}</option>
           </select></label>
-        <output>{{ visible.length }} {{ words.shown }} {{ tiles.size }} {{ words.robots }}</output>
+        <output v-if="loaded">{{ visible.length }} {{ words.shown }} {{ tiles.size }} {{ words.robots }}</output>
       </form>
-      <p v-if="!visible.length" role="status">{{ words.none }}</p>
+      <p v-if="!visible.length" role="status">{{ loaded ? words.none : words.loading }}</p>
       <ul class="wall">
         <li v-for="tile in visible" :key="tile.name">
           <a :href="'/robot?name=' + encodeURIComponent(tile.name)" :class="'edge-' + tile.states[0]">
@@ -30,6 +30,7 @@ export default {
   data() {
     return {
       tiles: new Map(),
+      loaded: false,
       search: "",
       chosen: { kind: "", site: "", mode: "", states: "" },
       format: new Intl.DateTimeFormat("sv-SE", { dateStyle: "short", timeStyle: "medium" }),
@@ -62,6 +63,7 @@ export default {
       return this.format.format(new Date(heard));
     },
     update(changed, gone) {
+      this.loaded = true;
       for (const tile of changed) this.tiles.set(tile.name, Object.freeze(tile));
       for (const name of gone) this.tiles.delete(name);
     },

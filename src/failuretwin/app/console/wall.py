@@ -26,7 +26,8 @@ STYLE = """
   border: 1px solid var(--line); border-left-width: .5rem; border-radius: .4rem; color: inherit;
   background: var(--soft); text-decoration: none; overflow-wrap: anywhere; }
 .wall a .badges { display: flex; flex-wrap: wrap; gap: .3rem; }
-.wall .said { font-size: .9rem; max-height: 4.2em; overflow: hidden; }
+.wall .said { font-size: .9rem; line-height: 1.4; display: -webkit-box; overflow: hidden;
+  -webkit-box-orient: vertical; -webkit-line-clamp: 3; }
 """ + "\n".join(f".wall .edge-{name} {{ border-left-color: {c}; }}" for name, c in COLOURS.items())
 
 
@@ -36,19 +37,20 @@ class Wall(ui.element, component="wall.js"):
     def __init__(self) -> None:
         super().__init__()
         self._props["words"] = texts.WALL_TEXTS
-        self._shown: dict[str, dict[str, Any]] = {}
+        self._shown: dict[str, dict[str, Any]] | None = None
 
     def show(self, tiles: dict[str, dict[str, Any]]) -> None:
         """Show these tiles."""
-        changed = [one for name, one in tiles.items() if self._shown.get(name) != one]
-        gone = [name for name in self._shown if name not in tiles]
-        if changed or gone:
+        shown = self._shown or {}
+        changed = [one for name, one in tiles.items() if shown.get(name) != one]
+        gone = [name for name in shown if name not in tiles]
+        if changed or gone or self._shown is None:
             self._shown = tiles
             self.run_method("update", changed, gone)
 
     def forget(self) -> None:
         """Send all tiles next time: the browser shows none."""
-        self._shown = {}
+        self._shown = None
 
 
 def show(visit: Visit) -> None:
