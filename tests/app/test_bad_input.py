@@ -220,7 +220,8 @@ def test_results_that_go_to_a_folder_that_is_not_writable(
 @pytest.mark.parametrize("suffix", [".nc", ".zarr"])
 @pytest.mark.usefixtures("simulated")  # compiles the loops, which a full disk cannot keep
 def test_full_disk_while_simulating(refused, suffix):
-    message = refused("simulate", "--out", f"x{suffix}", "--runs-per-class", 1, disk_full=True)
+    asked = ("--out", f"x{suffix}", "--runs-per-class", 1, "--calibration", "armpi_fpv")
+    message = refused("simulate", *asked, disk_full=True)
     assert f"x{suffix}: could not be written (File too large)" in message
 
 
