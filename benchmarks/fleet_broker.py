@@ -1,6 +1,6 @@
 """A fleet on a real nats-server: robots a core, latency, memory, bytes; and kills.
 
-    python benchmarks/fleet_broker.py filter --robots 30 100 300
+    python benchmarks/fleet_broker.py filter --robots 30 100 300 [--healthy]
     python benchmarks/fleet_broker.py broker --robots 50 100 --workers 1 2
     python benchmarks/fleet_broker.py transport --robots 1000 10000
     python benchmarks/fleet_broker.py kills --kills 50 --seconds 700
@@ -117,9 +117,9 @@ def envelopes(seconds: list[Second]) -> list[Envelope]:
 # The filter alone.
 
 
-def filter_alone(robots: Sequence[int]) -> None:
-    """Print processor time and memory of the filter."""
-    seconds = lives(LIVES, 40.0, now_and_then)
+def filter_alone(robots: Sequence[int], healthy: bool) -> None:
+    """Print processor time and memory of the filter; of robots that fail after 30 s, or of none."""
+    seconds = lives(LIVES, 40.0, (lambda number: ()) if healthy else now_and_then)
     for count in robots:
         before = memory_mb(os.getpid())
         messages = envelopes(repeated(seconds, count))
@@ -535,12 +535,13 @@ def main() -> None:
     parser.add_argument("part", choices=["filter", "broker", "transport", "kills"])
     parser.add_argument("--robots", type=int, nargs="+", default=[100])
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--healthy", action="store_true", help="filter robots without faults")
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=700.0)
     parser.add_argument("--pause", type=float, default=0.0)
     told = parser.parse_args()
     if told.part == "filter":
-        filter_alone(told.robots)
+        filter_alone(told.robots, told.healthy)
     elif told.part == "broker":
         through_broker(told.robots, told.workers)
     elif told.part == "transport":
