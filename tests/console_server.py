@@ -73,7 +73,7 @@ class ConsoleServer:
 
     def stop(self):
         self.process.send_signal(signal.SIGINT)
-        self.process.wait(30)
+        self.process.wait(120)  # loops that are being compiled hold it
 
 
 def open_browser():
