@@ -75,7 +75,7 @@ class Moments:
 
     @property
     def bent(self) -> FloatArray:
-        """Variance of each motor by what it shares of no bend, as `late` [rad2]."""
+        """Variance of each motor by its own share of the bend, same axes as `late` [rad2]."""
         return np.asarray((OWN_BEND * self.bend) ** 2)
 
     @property
