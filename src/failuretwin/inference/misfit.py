@@ -33,7 +33,7 @@ def highest_and_outlier(likelihood: RunLikelihood) -> tuple[FloatArray, FloatArr
         (run, movement) each; 0 where a movement is not usable.
     """
     model, evidence = likelihood.model, likelihood.evidence
-    healthy = likelihood.findings.expected[:, :, 0]
+    healthy = likelihood.healthy_pose
     scatter = model.scatter_at(Stretches.of(evidence.movements))
     _, _, spread = model.residual(evidence.point, healthy, scatter)
     highest = np.where(likelihood.usable, spread.log_norm(model.settling.tail_dof), 0.0)

@@ -261,7 +261,7 @@ class SeenRuns:
         None where none does.
         """
         sample, robot = self.sample, self.model.twin.robot
-        usable, healthy = sample.usable, sample.findings.expected[:, :, 0]
+        usable, healthy = sample.usable, sample.healthy_pose
         if not usable.any():
             return None
         poses = self.model.twin.path(healthy[usable]), sample.evidence.point[usable][:, :3]

@@ -243,7 +243,7 @@ class SetUpWeighing:
     def frames(self, first: SetUp) -> list[SetUp]:
         """Return the frame that explains settled poses best behind a mistake."""
         likelihood, model = self.behind([first]), self.likelihood.model
-        usable, healthy = likelihood.usable, likelihood.findings.expected[:, :, 0]
+        usable, healthy = likelihood.usable, likelihood.healthy_pose
         if usable.sum() < FEWEST_TO_TURN:
             return []
         expected, point = model.twin.path(healthy[usable]), likelihood.evidence.point[usable]

@@ -179,32 +179,37 @@ def refine(tables: Tables, picks: Places, noise: Noise, found: RowsPosterior) ->
 def _prior(tables: Tables, picks: Places, i: int) -> tuple[FloatArray, FloatArray]:
     """Return mean and covariance of f and, last, z."""
     n, place, variance = picks.normal[i], picks.place[i], picks.amount[i]
-    size, channels = tables.covariance.shape[-1], tables.mean.shape[-1]
+    known, covariance, H = tables.mean[n, place], tables.covariance[n, place], picks.lever[i]
+    size, channels = covariance.shape[-1], known.shape[-1]
     mean, whole = np.zeros(size + 1), np.zeros((size + 1, size + 1))
     for a in range(size):
-        mean[a] = tables.mean[n, place, a // channels, a % channels]
-        lever = variance * picks.lever[i, a // channels, a % channels]
+        mean[a] = known[a // channels, a % channels]
+        whole[a, size] = whole[size, a] = variance * H[a // channels, a % channels]
+    for a in range(size):
         for b in range(size):
-            own = lever * picks.lever[i, b // channels, b % channels]
-            whole[a, b] = tables.covariance[n, place, a, b] + own
-        whole[a, size] = whole[size, a] = lever
+            whole[a, b] = covariance[a, b] + whole[a, size] * H[b // channels, b % channels]
     whole[size, size] = variance
     return mean, whole
 
 
 @compiled
-def _write_scales(tables: Tables, picks: Places, i: int, m: int, scale: FloatArray) -> None:
-    """Write S_a of one moment, (outcome, channel, channel) [m2]."""
+def _write_scales(
+    tables: Tables, picks: Places, i: int, m: int, log_weight: FloatArray, scale: FloatArray
+) -> None:
+    """Write S_a of the outcomes of one moment that are possible, (outcome, channel, channel)."""
     n, place, (factor, uneven, noise) = picks.normal[i], picks.place[i], picks.variance[i]
+    scatter, late, extra = tables.scatter, tables.late, tables.extra
     outcomes, channels, _ = scale.shape
-    moves = tables.late.shape[-1] > 0
+    moves = late.shape[-1] > 0
     for a in range(outcomes):
+        if log_weight[a] == -np.inf:
+            continue
         for c in range(channels):
             for d in range(channels):
-                scatter = factor * tables.scatter[place, m, a, c, d]
+                of_motors = factor * scatter[place, m, a, c, d]
                 if moves:
-                    scatter += uneven * tables.late[place, m, a, c, d]
-                scale[a, c, d] = scatter + tables.extra[n, place, m, a, c, d]
+                    of_motors += uneven * late[place, m, a, c, d]
+                scale[a, c, d] = of_motors + extra[n, place, m, a, c, d]
             scale[a, c, c] += noise
 
 
@@ -243,12 +248,13 @@ def _carry(found: RowsPosterior, i: int, m: int, kept: float) -> None:
 @compiled
 def _put_aside(found: RowsPosterior, i: int, m: int, f: FloatArray, whole: FloatArray) -> None:
     """Keep what is known of the numbers of a moment without it."""
-    channels = found.ahead.shape[-1]
+    ahead, doubt = found.ahead[i, m], found.doubt[i, m]
+    channels = len(ahead)
     at = m * channels
     for c in range(channels):
-        found.ahead[i, m, c] = f[at + c]
+        ahead[c] = f[at + c]
         for d in range(channels):
-            found.doubt[i, m, c, d] = whole[at + c, at + d]
+            doubt[c, d] = whole[at + c, at + d]
 
 
 @compiled
@@ -262,11 +268,12 @@ def _integrate(
     scale: FloatArray,
 ) -> float:
     """Write what a moment says of its numbers to `found`; return log Z. `scale` is room."""
-    _write_scales(tables, picks, i, m, scale)
+    log_weight = found.log_weight[i, m]
+    _write_scales(tables, picks, i, m, log_weight, scale)
     moment = Moment(
         tables.residual[picks.normal[i], picks.place[i], m],
         scale,
-        found.log_weight[i, m],
+        log_weight,
         found.ahead[i, m],
         found.doubt[i, m],
     )
@@ -312,19 +319,16 @@ def _filter(tables: Tables, picks: Places, noise: Noise, found: RowsPosterior) -
 def _take(f: FloatArray, whole: FloatArray, at: int, pull: FloatArray, B: FloatArray) -> None:
     """Take what a moment says of its numbers: f += K pull, K -= K B K."""
     size, channels = len(f), len(pull)
-    cross, crossed = np.empty((size, channels)), np.empty(channels)
+    cross = whole[at : at + channels].copy()
     for i in range(size):
         for c in range(channels):
-            cross[i, c] = whole[i, at + c]
-    for i in range(size):
+            f[i] += cross[c, i] * pull[c]
         for c in range(channels):
-            f[i] += cross[i, c] * pull[c]
-            crossed[c] = 0.0
+            crossed = 0.0
             for d in range(channels):
-                crossed[c] += cross[i, d] * B[d, c]
-        for j in range(size):
-            for c in range(channels):
-                whole[i, j] -= crossed[c] * cross[j, c]
+                crossed += cross[d, i] * B[d, c]
+            for j in range(size):
+                whole[i, j] -= crossed * cross[c, j]
 
 
 @compiled

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from failuretwin.core.compiled import compiled
+from failuretwin.core.compiled import compiled, inlined
 from failuretwin.core.numerics import log_fall, log_norm
 from failuretwin.core.types import FloatArray
 
@@ -37,8 +37,6 @@ NEARLY_NORMAL = 200.0
 KEPT_NATS = 5.0
 """Outcomes of a moment that are integrated in full: the best, and those so near to it or to the
 outlier; the rest count with their density."""
-NEGLIGIBLE = 1e-14
-"""Normal distributions with a smaller share pull at nothing."""
 
 
 @lru_cache
@@ -104,6 +102,29 @@ def log_density(noise: Noise, square: float, determinant: float) -> float:
     return noise.log_norm - 0.5 * np.log(determinant) + fall
 
 
+@inlined
+def _inverse_of_three(
+    a: float, b: float, c: float, d: float, e: float, f: float
+) -> tuple[float, float, float, float, float, float, float]:
+    """Return the inverse of [[a, b, d], [b, c, e], [d, e, f]] in this order, and its determinant.
+
+    The inverse is the adjugate over the determinant.
+    """
+    first, second, third = c * f - e * e, d * e - b * f, b * e - c * d
+    determinant = a * first + b * second + d * third
+    factor = 1.0 / determinant
+    fourth, fifth, sixth = a * f - d * d, b * d - a * e, a * c - b * b
+    return (
+        first * factor,
+        second * factor,
+        fourth * factor,
+        third * factor,
+        fifth * factor,
+        sixth * factor,
+        determinant,
+    )
+
+
 @compiled
 def invert(matrix: FloatArray) -> float:
     """Replace a positive definite matrix by its inverse; return its determinant.
@@ -113,16 +134,13 @@ def invert(matrix: FloatArray) -> float:
     """
     size, determinant = len(matrix), 1.0
     if size == 3:
-        a, b, c = matrix[0, 0], matrix[1, 0], matrix[1, 1]
-        d, e, f = matrix[2, 0], matrix[2, 1], matrix[2, 2]
-        first, second, third = c * f - e * e, d * e - b * f, b * e - c * d
-        determinant = a * first + b * second + d * third
-        factor = 1.0 / determinant
-        matrix[0, 0], matrix[1, 1] = first * factor, (a * f - d * d) * factor
-        matrix[2, 2] = (a * c - b * b) * factor
-        matrix[0, 1] = matrix[1, 0] = second * factor
-        matrix[0, 2] = matrix[2, 0] = third * factor
-        matrix[1, 2] = matrix[2, 1] = (b * d - a * e) * factor
+        a, b, c, d, e, f, determinant = _inverse_of_three(
+            matrix[0, 0], matrix[1, 0], matrix[1, 1], matrix[2, 0], matrix[2, 1], matrix[2, 2]
+        )
+        matrix[0, 0], matrix[1, 1], matrix[2, 2] = a, c, f
+        matrix[0, 1] = matrix[1, 0] = b
+        matrix[0, 2] = matrix[2, 0] = d
+        matrix[1, 2] = matrix[2, 1] = e
         return determinant
     for k in range(size):
         pivot = matrix[k, k]
@@ -143,10 +161,6 @@ def invert(matrix: FloatArray) -> float:
     return determinant
 
 
-Work = tuple[FloatArray, FloatArray]
-"""Room for a matrix and a vector of channels."""
-
-
 class Moment(NamedTuple):
     """One moment under one row.
 
@@ -165,22 +179,33 @@ class Moment(NamedTuple):
     covariance: FloatArray
 
 
-@compiled
+Room = tuple[FloatArray, FloatArray]
+"""Room for a matrix and a vector of channels."""
+
+
+@inlined
 def _whitened(
-    moment: Moment, a: int, factor: float, precision: FloatArray, pull: FloatArray
+    three: bool,
+    residual: FloatArray,
+    scale: FloatArray,
+    mean: FloatArray,
+    covariance: FloatArray,
+    a: int,
+    share: float,
+    precision: FloatArray,
+    pull: FloatArray,
 ) -> tuple[float, float]:
-    """Write C^-1 and C^-1 (r - m) of C = K + S_a / factor.
+    """Write C^-1, its lower half at least, and C^-1 (r_a - m) of C = K + share S_a.
+
+    Whole arrays are passed, each by itself: to take one out of a tuple or a row out of an array
+    costs more than the sums.
 
     Returns:
         Squared distance of the outcome, and the determinant of C.
     """
-    residual, scale, mean, covariance = (
-        moment.residual,
-        moment.scale,
-        moment.mean,
-        moment.covariance,
-    )
-    size, square, share = len(pull), 0.0, 1.0 / factor
+    if three:
+        return _whitened_of_three(residual, scale, mean, covariance, a, share, precision, pull)
+    size, square = len(pull), 0.0
     for i in range(size):
         for j in range(size):
             precision[i, j] = covariance[i, j] + scale[a, i, j] * share
@@ -194,68 +219,120 @@ def _whitened(
     return square, determinant
 
 
-@compiled
-def _write_glance(moment: Moment, noise: Noise, work: Work, glance: FloatArray) -> int:
+@inlined
+def _whitened_of_three(
+    residual: FloatArray,
+    S: FloatArray,
+    mean: FloatArray,
+    K: FloatArray,
+    a: int,
+    share: float,
+    precision: FloatArray,
+    pull: FloatArray,
+) -> tuple[float, float]:
+    """Do the same of three channels, the most frequent number, without loops."""
+    x, y, z = residual[a, 0] - mean[0], residual[a, 1] - mean[1], residual[a, 2] - mean[2]
+    xx, yx, yy, zx, zy, zz, determinant = _inverse_of_three(
+        K[0, 0] + S[a, 0, 0] * share,
+        K[1, 0] + S[a, 1, 0] * share,
+        K[1, 1] + S[a, 1, 1] * share,
+        K[2, 0] + S[a, 2, 0] * share,
+        K[2, 1] + S[a, 2, 1] * share,
+        K[2, 2] + S[a, 2, 2] * share,
+    )
+    precision[0, 0], precision[1, 0], precision[1, 1] = xx, yx, yy
+    precision[2, 0], precision[2, 1], precision[2, 2] = zx, zy, zz
+    pull[0] = xx * x + yx * y + zx * z
+    pull[1] = yx * x + yy * y + zy * z
+    pull[2] = zx * x + zy * y + zz * z
+    return pull[0] * x + pull[1] * y + pull[2] * z, determinant
+
+
+@inlined
+def _write_glance(three: bool, moment: Moment, noise: Noise, room: Room, glance: FloatArray) -> int:
     """Write log weight and density of each outcome, what is left of f as scatter.
 
     Returns:
         The likeliest outcome.
     """
-    best = 0
+    best, (residual, scale, log_weight, mean, covariance) = 0, moment
+    precision, pull = room
     for a in range(len(glance)):
         glance[a] = -np.inf
-        if moment.log_weight[a] > -np.inf:
-            square, determinant = _whitened(moment, a, 1.0, *work)
-            glance[a] = moment.log_weight[a] + log_density(noise, square, determinant)
+        if log_weight[a] > -np.inf:
+            square, determinant = _whitened(
+                three, residual, scale, mean, covariance, a, 1.0, precision, pull
+            )
+            glance[a] = log_weight[a] + log_density(noise, square, determinant)
         if glance[a] > glance[best]:
             best = a
     return best
 
 
-@compiled
-def _write_heights(
-    moment: Moment, noise: Noise, work: Work, a: int, top: float, height: FloatArray
-) -> float:
-    """Write weight times integral of the normal distributions of an outcome, over exp(top).
-
-    Returns:
-        Their sum.
-    """
-    size, total = len(moment.mean), 0.0
-    for q in range(len(height)):
-        factor = noise.factors[q]
-        square, determinant = _whitened(moment, a, factor, *work)
-        surplus = 0.5 * (size - noise.dims) * np.log(factor)
-        constant = noise.log_omega[q] - surplus - 0.5 * noise.dims * np.log(2.0 * np.pi)
-        log_height = constant + moment.log_weight[a] - 0.5 * square - top
-        height[q] = np.exp(log_height) / np.sqrt(determinant)
-        total += height[q]
-    return total
-
-
-@compiled
-def _write_pooled(
+@inlined
+def _add_outcomes(
+    three: bool,
     moment: Moment,
     noise: Noise,
-    work: Work,
+    room: Room,
+    top: float,
     share: FloatArray,
     alpha: FloatArray,
     curvature: FloatArray,
-) -> None:
-    """Write alpha and B by the share of each normal distribution, (outcome, normal)."""
-    size, (precision, pull) = len(alpha), work
+) -> tuple[float, float]:
+    """Add what the normal distributions of outcomes say of f, times their height.
+
+    Args:
+        three: Whether there are three channels.
+        moment: The outcomes.
+        noise: The Student t.
+        room: Room.
+        top: Log of the height that counts as 1.
+        share: Log of each outcome at a glance; becomes its height, weight times integral, if it is
+            integrated in full, else minus its height at a glance.
+        alpha: Sum of height C^-1 (r - m), (channel,).
+        curvature: Sum of height (C^-1 - C^-1 (r - m)(r - m)^T C^-1), its lower half.
+
+    Returns:
+        Heights of the outcomes that are integrated in full, and what they were at a glance.
+    """
+    size, (residual, scale, log_weight, mean, covariance) = len(alpha), moment
+    (precision, pull), factors, log_omega = room, noise.factors, noise.log_omega
+    constant, surplus = -top - 0.5 * noise.dims * np.log(2.0 * np.pi), 0.5 * (size - noise.dims)
+    least = min(top - KEPT_NATS, share.max())
+    exact, rough = 0.0, 0.0
     for a in range(len(share)):
-        for q in range(share.shape[1]):
-            weight = share[a, q]
-            if weight > NEGLIGIBLE:
-                _whitened(moment, a, noise.factors[q], precision, pull)
-                for i in range(size):
-                    alpha[i] += weight * pull[i]
-                    for j in range(size):
-                        curvature[i, j] += weight * (precision[i, j] - pull[i] * pull[j])
-    for i in range(size):
-        for j in range(size):
-            curvature[i, j] += alpha[i] * alpha[j]
+        glance = np.exp(share[a] - top)
+        if not share[a] >= least or share[a] == -np.inf:
+            share[a] = -glance
+            continue
+        rough, total = rough + glance, 0.0
+        for q in range(len(factors)):
+            square, determinant = _whitened(
+                three, residual, scale, mean, covariance, a, 1.0 / factors[q], precision, pull
+            )
+            log_height = constant + log_omega[q] + log_weight[a] - 0.5 * square
+            if surplus != 0.0:
+                log_height -= surplus * np.log(factors[q])
+            height = np.exp(log_height) / np.sqrt(determinant)
+            total += height
+            for i in range(size):
+                alpha[i] += height * pull[i]
+                for j in range(i + 1):
+                    curvature[i, j] += height * (precision[i, j] - pull[i] * pull[j])
+        share[a] = total
+        exact += total
+    return exact, rough
+
+
+@inlined
+def _finish(alpha: FloatArray, curvature: FloatArray, counted: float) -> None:
+    """Make alpha and B of sums of heights, of which each counts so much."""
+    for i in range(len(alpha)):
+        alpha[i] *= counted
+        for j in range(i + 1):
+            curvature[i, j] = curvature[i, j] * counted + alpha[i] * alpha[j]
+            curvature[j, i] = curvature[i, j]
 
 
 @compiled
@@ -271,33 +348,38 @@ def moment_integral(
         alpha: (channel,), written.
         curvature: B, (channel, channel), written.
     """
-    count, size, glance = len(share), len(alpha), share
-    work = np.empty((size, size)), np.empty(size)
-    best = _write_glance(moment, noise, work, glance)
-    top = max(glance[best], noise.log_outlier)
-    height, exact, rough = np.zeros((count, len(noise.factors))), 0.0, 0.0
-    kept = np.zeros(count, dtype=np.bool_)
-    for a in range(count):
-        kept[a] = glance[a] > top - KEPT_NATS or (a == best and glance[a] > -np.inf)
-        if kept[a]:
-            rough += np.exp(glance[a] - top)
-            share[a] = _write_heights(moment, noise, work, a, top, height[a])
-            exact += share[a]
+    if len(alpha) == 3:
+        return _integral(True, moment, noise, share, alpha, curvature)
+    return _integral(False, moment, noise, share, alpha, curvature)
+
+
+@inlined
+def _integral(
+    three: bool,
+    moment: Moment,
+    noise: Noise,
+    share: FloatArray,
+    alpha: FloatArray,
+    curvature: FloatArray,
+) -> float:
+    """Do what `moment_integral` does; whether there are three channels is told as a constant."""
+    count, size = len(share), len(alpha)
+    room = np.empty((size, size)), np.empty(size)
+    best = _write_glance(three, moment, noise, room, share)
+    top = max(share[best], noise.log_outlier)
+    alpha[:], curvature[:] = 0.0, 0.0
+    exact, rough = _add_outcomes(three, moment, noise, room, top, share, alpha, curvature)
     # What is left of f counts as scatter at the glance: wrong by as much for the others.
     ratio, left = exact / rough if rough > 0.0 and exact > 0.0 else 1.0, 0.0
     for a in range(count):
-        if not kept[a]:
-            share[a] = np.exp(glance[a] - top) * ratio
+        if share[a] < 0.0:
+            share[a] *= -ratio
             left += share[a]
     whole = exact + left + np.exp(noise.log_outlier - top)
-    # Those that are left pull as these do.
-    counted = (1.0 + left / max(exact, 1e-300)) / whole
     for a in range(count):
         share[a] /= whole
-        for q in range(height.shape[1]):
-            height[a, q] *= counted
-    alpha[:], curvature[:] = 0.0, 0.0
-    _write_pooled(moment, noise, work, height, alpha, curvature)
+    # Those that are left pull as these do.
+    _finish(alpha, curvature, (1.0 + left / max(exact, 1e-300)) / whole)
     return float(top + np.log(whole))
 
 

@@ -15,9 +15,38 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from failuretwin.core.compiled import compiled
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.engine.moments import Moments
 from failuretwin.inference.observation.healthy_model import HealthyModel
+
+
+def seen_variance(jacobian: FloatArray, variance: FloatArray) -> FloatArray:
+    """Return J diag(v) J^T, (..., channel, channel) [m2].
+
+    Args:
+        jacobian: J, (..., channel, motor) [m/rad].
+        variance: v, (..., motor) [rad2].
+    """
+    channels, motors = jacobian.shape[-2:]
+    lead = jacobian.shape[:-2]
+    flat = np.ascontiguousarray(np.broadcast_to(variance, (*lead, motors))).reshape(-1, motors)
+    found = np.empty((*lead, channels, channels))
+    J = np.ascontiguousarray(jacobian).reshape(-1, channels, motors)
+    _write_seen_variance(J, flat, found.reshape(-1, channels, channels))
+    return found
+
+
+@compiled
+def _write_seen_variance(J: FloatArray, variance: FloatArray, found: FloatArray) -> None:
+    """Write J diag(v) J^T, (item, channel, channel)."""
+    for n in range(len(J)):
+        for c in range(J.shape[1]):
+            for d in range(c + 1):
+                total = 0.0
+                for k in range(J.shape[2]):
+                    total += J[n, c, k] * J[n, d, k] * variance[n, k]
+                found[n, c, d] = found[n, d, c] = total
 
 
 @dataclass(frozen=True)
@@ -60,13 +89,12 @@ class Outcomes:
         point = moments.point
         between = expected.ndim - point.ndim
         point = point.reshape(*point.shape[:2], *(1,) * between, point.shape[-1])
-        transposed = np.swapaxes(jacobian, -1, -2)
-        scatter = np.matmul(jacobian * np.asarray(variance)[..., None, :], transposed)
+        scatter = seen_variance(jacobian, variance)
         extra, uneven = np.broadcast_to(0.0, scatter.shape), scatter[..., :0, :0]
         if beside.any():
-            extra = np.matmul(jacobian * beside[..., None, :], transposed)
+            extra = seen_variance(jacobian, beside)
         if moments.late.any():
-            uneven = np.matmul(jacobian * late[..., None, :], transposed)
+            uneven = seen_variance(jacobian, late)
         return cls(point - expected, scatter, uneven, extra)
 
     @property

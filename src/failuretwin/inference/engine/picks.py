@@ -124,7 +124,7 @@ def _tables(
         V, mu = V[:, unknown[:, None], unknown], np.ascontiguousarray(mu[:, unknown])
         variance = np.ascontiguousarray(np.diagonal(V, axis1=1, axis2=2))
         shift, spread = np.zeros(G.shape[:4]), np.zeros((*G.shape[:4], G.shape[3]))
-        _add_apart(G, unknown, variance, mu, shift, spread)
+        _write_apart(G, unknown, variance, mu, shift, spread)
         residuals.append(outcomes.residual - shift[:, :, usual])
         extras.append(outcomes.beside + spread[:, :, usual])
         means.append((of_f @ mu[..., None]).reshape(*G.shape[:2], G.shape[3]))
@@ -142,7 +142,7 @@ def _tables(
 
 
 @compiled
-def _add_apart(
+def _write_apart(
     G: FloatArray,
     unknown: IntArray,
     variance: FloatArray,
@@ -150,7 +150,7 @@ def _add_apart(
     shift: FloatArray,
     spread: FloatArray,
 ) -> None:
-    """Add what outcomes differ by from f, as if parts of theta were independent.
+    """Write what outcomes differ by from f, as if parts of theta were independent.
 
     Args:
         G: Columns, (place, moment, outcome, channel, theta).
@@ -161,17 +161,23 @@ def _add_apart(
         spread: Its covariance, (place, moment, outcome, channel, channel) [m2].
     """
     places, moments, outcomes, channels, _ = G.shape
-    off = np.zeros(channels)
+    many = len(unknown)
+    off = np.empty((many, channels))
     for p in range(places):
         for m in range(moments):
             for a in range(1, outcomes):
-                for t, at in enumerate(unknown):
-                    for c in range(channels):
-                        off[c] = G[p, m, a, c, at] - G[p, m, 0, c, at]
-                        shift[p, m, a, c] += off[c] * mu[p, t]
-                    for c in range(channels):
-                        for d in range(channels):
-                            spread[p, m, a, c, d] += off[c] * off[d] * variance[p, t]
+                for c in range(channels):
+                    total = 0.0
+                    for t in range(many):
+                        off[t, c] = G[p, m, a, c, unknown[t]] - G[p, m, 0, c, unknown[t]]
+                        total += off[t, c] * mu[p, t]
+                    shift[p, m, a, c] = total
+                for c in range(channels):
+                    for d in range(c + 1):
+                        total = 0.0
+                        for t in range(many):
+                            total += off[t, c] * off[t, d] * variance[p, t]
+                        spread[p, m, a, c, d] = spread[p, m, a, d, c] = total
 
 
 @dataclass(frozen=True)

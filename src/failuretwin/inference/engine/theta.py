@@ -241,21 +241,24 @@ def columns(model: HealthyModel, pose: FloatArray, motion: Motion, layout: Layou
         layout: Places in theta.
     """
     value, jacobian = model.sensors.expected(pose)
-    rigid = np.zeros((*value.shape, REGISTRATION))
+    found = np.zeros((*value.shape, layout.size))
     own = model.sensors.registered
     if own is not None:
         x = value[..., own]
-        rigid[..., own, :3] = np.eye(3)
-        rigid[..., own, 3:6] = np.swapaxes(np.cross(np.eye(3), x[..., None, :]), -1, -2)
-        rigid[..., own, 6] = x
+        for axis, (left, right) in enumerate(((1, 2), (2, 0), (0, 1))):
+            found[..., own.start + axis, axis] = 1.0
+            found[..., own.start + right, 3 + axis] = x[..., left]
+            found[..., own.start + left, 3 + axis] = -x[..., right]
+        found[..., own, 6] = x
     load = loads(model, pose)[..., None, :]
-    parts = [rigid, jacobian, jacobian * load, -jacobian * motion.direction[..., None, :]]
+    parts = [jacobian, jacobian * load, -jacobian * motion.direction[..., None, :]]
     if layout.geometry:
         parts.append(model.twin.geometry_columns(pose))
     if layout.moving:
         parts.append(-jacobian * motion.speed[..., None, :])
         parts.append(jacobian @ motion.bend[..., None])
-    return np.concatenate(parts, axis=-1)
+    np.concatenate(parts, axis=-1, out=found[..., REGISTRATION:])
+    return found
 
 
 def has_geometry(model: HealthyModel) -> bool:

@@ -46,6 +46,7 @@ class RunLikelihood:
         moving: Readings on the way; None: they are left aside.
         transient_scatter_factor: Factor on the scatter of the way alone; 1 for a robot as it is.
         remembered: What every movement says by itself, where that was computed before.
+        part_of: All runs, and which of them these are; None: these are all.
         healthy: Log density of each settled position if no motor is faulty, (run, movement), where
             that is not what the movements say of a healthy robot.
         memo: What was found on the way of each motor, by kind and index of the motor.
@@ -57,6 +58,9 @@ class RunLikelihood:
     transient_scatter_factor: float = 1.0
     remembered: MovementLikelihoods | None = None
     healthy: FloatArray | None = None
+    part_of: tuple[RunLikelihood, IntArray | slice] | None = field(
+        default=None, compare=False, repr=False
+    )
     memo: dict[tuple[str, int], FloatArray] = field(
         default_factory=dict, init=False, compare=False, repr=False
     )
@@ -66,7 +70,7 @@ class RunLikelihood:
         rows = slice(run, run + 1) if isinstance(run, int | np.integer) else run
         moving = None if self.moving is None else self.moving[rows]
         return replace(
-            self, evidence=self.evidence[rows], moving=moving, remembered=self.findings[rows]
+            self, evidence=self.evidence[rows], moving=moving, remembered=None, part_of=(self, rows)
         )
 
     def alike(self, runs: IntArray) -> RunLikelihood:
@@ -89,7 +93,17 @@ class RunLikelihood:
         """What every movement says by itself."""
         if self.remembered is not None and self.remembered.model is self.model:
             return self.remembered
+        if self.part_of is not None and self.part_of[0].model is self.model:
+            whole, rows = self.part_of
+            return whole.findings[rows]
         return movement_likelihoods(self.evidence, self.model)
+
+    @cached_property
+    def healthy_pose(self) -> FloatArray:
+        """Where a healthy arm settles if its commands arrive, (run, movement, motor) [rad]."""
+        outcomes = self.model.outcomes_as_seen(self.evidence)
+        base, direction = outcomes.base[:, :, 0], outcomes.direction[:, :, 0]
+        return self.model.settle(base, direction, self.model.none_held)
 
     @property
     def outcomes(self) -> CommandOutcomes:

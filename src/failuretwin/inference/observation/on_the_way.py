@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from failuretwin.core.compiled import compiled
 from failuretwin.core.movements import Stretches
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.inference.observation.between_commands import strays_between
@@ -48,6 +49,14 @@ LEAST_FRICTION_RAD = 1e-4
 """Friction that counts as none [rad]."""
 CURVED_RAD = 0.01
 """A movement whose command strays further from straight ramps is a curve [rad]."""
+
+
+@compiled
+def _follow(steps: FloatArray, found: FloatArray) -> None:
+    """Follow the direction of friction of each motor, (motor,), along steps (step, motor)."""
+    for n in range(len(steps)):
+        for k in range(len(found)):
+            found[k] = min(max(found[k] + steps[n, k], -1.0), 1.0)
 
 
 @dataclass(frozen=True)
@@ -200,8 +209,7 @@ class _Looks:
         steps = np.diff(command[time <= when], axis=0)
         width = np.maximum(np.asarray(self.model.settling.friction), LEAST_FRICTION_RAD)
         found = np.zeros(command.shape[1])
-        for step in steps[np.abs(steps).max(axis=1) > 0.0] / width:
-            found = np.clip(found + step, -1.0, 1.0)
+        _follow(steps / width, found)
         return found
 
     def _told(self, run: int) -> tuple[FloatArray, FloatArray]:
