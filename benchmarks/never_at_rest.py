@@ -35,7 +35,6 @@ from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.servo import first_order_lag
 from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin, Drive, ServoEngine
-from failuretwin.inference.observation.healthy_model import HealthyModel
 
 STEP_S, DURATION_S = 0.008, 10.0
 DELAY_S, LAG_S = (0.0, 0.05), (0.02, 0.05)
@@ -48,6 +47,11 @@ WANDER_S = 1.0
 """Time within which the scatter of a moving motor is another [s]."""
 NOISE_OF_REACH = 5e-4
 """Noise of the tool sensor on each axis, in the reach."""
+
+MOTIONS_TRIED = 3
+"""Motions by which the smallest error that is seen is told."""
+ONSET_OF_CURVES = 0.2, 0.5
+"""When errors on curves come, as shares of a run."""
 
 Path = Callable[[Robot, FloatArray, np.random.Generator], tuple[FloatArray, FloatArray]]
 """Command (time, motor) [rad] of a robot, and when its strokes end [s]; curves have none."""
@@ -146,6 +150,17 @@ def cases(robot: Robot, healthy: int, faulty: int, seed: int) -> Iterator[Case]:
                 yield Case(mode, motor, seed + 1000 * (motor + 1) + n)
 
 
+def smallest_seen(robot: Robot, motion: Path, seed: int) -> FloatArray:
+    """Return the smallest error of each motor that a motion shows, (motor,) [rad]; NaN: none."""
+    time = as_floats(STEP_S * np.arange(round(DURATION_S / STEP_S) + 1))
+    made = [motion(robot, time, np.random.default_rng([seed, n])) for n in range(MOTIONS_TRIED)]
+    onset = 0.0 if len(made[0][1]) else float(np.mean(ONSET_OF_CURVES)) * DURATION_S
+    names = [f"{motor}:steady_state_error" for motor in robot.motor_names]
+    commands = np.stack([command for command, _ in made])
+    found = ft.isolability(robot, commands, time, "generic", names, onset_s=onset).detected
+    return np.array([np.nan if found[name] is None else found[name] for name in names])
+
+
 @dataclass(frozen=True)
 class Arm:
     """What one robot is like: where its motors settle, how far they trail their commands [s]."""
@@ -171,23 +186,26 @@ def simulated(
     case: Case,
     rate: float,
     late: float,
+    seen: FloatArray,
     arm: Arm | None = None,
     duration_s: float = DURATION_S,
 ) -> RunTable:
-    """Return one run of an arm; None: of one of its own."""
+    """Return one run of an arm; None: of one of its own.
+
+    Errors are in units of the smallest that are seen of each motor, (motor,) [rad].
+    """
     rng = np.random.default_rng([case.seed, len(robot.motors)])
     time = as_floats(STEP_S * np.arange(round(duration_s / STEP_S) + 1))
     (command, strokes), motors = motion(robot, time, rng), len(robot.motors)
-    usual, arm = generic_imperfections(robot), arm or Arm.drawn(robot, rng)
+    arm = arm or Arm.drawn(robot, rng)
     settling = arm.settling
     knots = np.arange(0.0, duration_s + 2.0 * WANDER_S, WANDER_S)
     scatter = CubicSpline(knots, rng.standard_normal((len(knots), motors)))(time)
     scatter *= np.asarray(settling.scatter)
-    model = HealthyModel.of(robot, usual)
     error, onset = np.zeros((len(time), motors)), np.nan
     if case.fault == "steady_state_error":
-        onset = 0.0 if len(strokes) else rng.uniform(0.2, 0.5) * duration_s
-        error[:, case.motor] = _errors(time, strokes, onset, rng) * model.least_visible[case.motor]
+        onset = 0.0 if len(strokes) else rng.uniform(*ONSET_OF_CURVES) * duration_s
+        error[:, case.motor] = _errors(time, strokes, onset, rng) * seen[case.motor]
     speed = np.gradient(command, STEP_S, axis=0)
     friction = np.asarray(settling.friction) * _direction(speed)
     wanted = command + np.asarray(settling.bias) - friction + scatter + error
@@ -352,12 +370,16 @@ def main() -> None:
         for motion in given.motion:
             some = list(cases(robot, given.healthy, given.faulty, given.seed))
             arm = Arm.drawn(robot, np.random.default_rng(given.seed)) if given.folder else None
-            sensed = given.rate, given.clock, arm
+            seen = smallest_seen(robot, MOTIONS[motion], given.seed)
+            told = ", ".join(f"{value:.2f}" for value in np.degrees(seen))
+            print(f"{name} {motion}: errors are seen from {told} deg on", flush=True)
+            some = [c for c in some if c.fault != "steady_state_error" or seen[c.motor] > 0.0]
+            sensed = given.rate, given.clock, seen, arm
             if given.watch:
-                told = (*sensed, given.watch)
-                streams = (simulated(robot, MOTIONS[motion], c, *told) for c in some)
-                seen = [watched(robot, stream) for stream in streams]
-                print(f"{name} {motion}: {watch_line(seen, given.watch)}", flush=True)
+                lasts = (*sensed, given.watch)
+                streams = (simulated(robot, MOTIONS[motion], c, *lasts) for c in some)
+                alarms = [watched(robot, stream) for stream in streams]
+                print(f"{name} {motion}: {watch_line(alarms, given.watch)}", flush=True)
                 continue
             tables = [simulated(robot, MOTIONS[motion], c, *sensed) for c in some]
             runs = concatenate([table.to_dataset() for table in tables])

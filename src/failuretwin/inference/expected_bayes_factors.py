@@ -5,6 +5,9 @@
 The truth of each run is made again without scatter, losses and glitches, seen where the run was
 seen, and laid beside the best member of every hypothesis, in units of the declared scatter.
 
+Runs that hardly rest are judged by moments on the way, as recorded ones are: D is then the
+difference of their log evidence, and sums over sizes, onsets and all that is unknown of the robot.
+
 Section: docs/isolability.md#method
 """
 
@@ -22,7 +25,7 @@ from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses, parse_hypo
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.numerics import log_of
 from failuretwin.core.runs import check_motors, check_runs
-from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.data_knowledge.signals import noise_free_path
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.twin import DigitalTwin
@@ -30,6 +33,7 @@ from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.injection import Injection, replayed
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.engine.registration import evidence_at_once
 from failuretwin.inference.faults.marginal import change_points, movement_log_likelihoods
 from failuretwin.inference.faults.missed_movements import log_densities
 from failuretwin.inference.faults.priors import Priors
@@ -37,6 +41,7 @@ from failuretwin.inference.movements.joint_likelihood import JointLikelihood, mo
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.on_the_way import CURVED_RAD, likeliest_lag, on_the_way
 from failuretwin.inference.observation.readings import measured_samples
 from failuretwin.inference.posterior import (
     check_diagnosable,
@@ -220,21 +225,41 @@ class ExpectedLogBayesFactor:
     def _fits(
         self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]], onset: FloatArray
     ) -> FloatArray:
-        evidence = Evidence(self.noise_free(runs, faults), self.model.settings)
-        moving = evidence.transient if self._needs_way else None
-        likelihood = expected_run_likelihood(evidence.settled, self.model, moving)
-        first = first_affected(evidence.settled.movements, onset)
+        evidence = Evidence(self.noise_free(runs, faults), self.model.settings, self.model.sensors)
+        seen = on_the_way(evidence, self.model, likeliest_lag(evidence, self.model))
+        moving = seen.on_the_way
+        found = np.empty((len(moving), len(self.hypotheses)))
+        for kind in np.unique(moving):
+            rows = np.flatnonzero(moving == kind)
+            found[rows] = (
+                self._fits_moving(seen.alike(rows))
+                if kind
+                else self._fits_at_rest(evidence, onset, rows)
+            )
+        return found
+
+    def _fits_at_rest(self, evidence: Evidence, onset: FloatArray, rows: IntArray) -> FloatArray:
+        """Return how well the best member of each hypothesis fits some runs that rest."""
+        settled = evidence.settled[rows]
+        moving = evidence.transient[rows] if self._needs_way else None
+        likelihood = expected_run_likelihood(settled, self.model, moving)
+        first = first_affected(settled.movements, onset[rows])
         return np.stack(
             [max_likelihood(likelihood, h, self.priors, first) for h in self.hypotheses], axis=1
         )
 
+    def _fits_moving(self, seen: SettledEvidence) -> FloatArray:
+        """Return the log evidence of each hypothesis by moments on the way."""
+        return evidence_at_once(RunLikelihood(seen, self.model), self.hypotheses, self.priors)
+
     def noise_free(self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]]) -> xr.Dataset:
         """Return the runs as they would be seen if nothing were left to chance."""
         twin, time = self.model.twin, as_floats(runs["time"].values)
+        movements, faults = _as_commanded(runs, faults)
         path = noise_free_path(
             twin,
             self.model.imperfections,
-            commanded(runs),
+            movements,
             time,
             Injection(faults, twin.robot.motor_names, MODES),
         )
@@ -247,6 +272,45 @@ class ExpectedLogBayesFactor:
         modes = [MODES[fault.mode] for h in self.hypotheses for fault in h.faults]
         on_way = any(mode.signature is Signature.TRANSIENT for mode in modes)
         return on_way and self.model.knows_timing
+
+
+KNOT_S = 0.04
+"""Time between the corners of lines that stand for a command that is no ramp [s]."""
+
+
+def _as_commanded(
+    runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]]
+) -> tuple[Movements, Sequence[Sequence[FaultValue]]]:
+    """Return movements that go where runs were told to go, and faults with values for each.
+
+    A curve is one movement of the run set. Here it is many short ramps, which share what a fault
+    draws for the movement.
+    """
+    told, time = commanded(runs), as_floats(runs["time"].values)
+    command = as_floats(runs["command"].values)
+    if np.abs(told.reference(time) - command).max(initial=0.0) <= CURVED_RAD:
+        return told, faults
+    step = max(1, round(KNOT_S / (time[1] - time[0])))
+    knots = command[:, ::step]
+    start = np.broadcast_to(time[::step][:-1], (len(knots), knots.shape[1] - 1))
+    lasts = np.full(knots[:, 1:].shape, step * (time[1] - time[0]))
+    number = np.stack(
+        [
+            np.searchsorted(own[np.isfinite(own)], at, side="right") - 1
+            for own, at in zip(told.start, start, strict=True)
+        ]
+    )
+    number = np.maximum(number, 0)
+    return Movements(knots[:, 0], knots[:, 1:], lasts, np.array(start)), [
+        [_of_parts(fault, number[run]) for fault in group] for run, group in enumerate(faults)
+    ]
+
+
+def _of_parts(fault: FaultValue, number: IntArray) -> FaultValue:
+    """Return a fault with a value for each part of its movements, of which the number is given."""
+    return replace(
+        fault, per_movement={name: values[number] for name, values in fault.per_movement.items()}
+    )
 
 
 def commanded(runs: xr.Dataset) -> Movements:
