@@ -150,15 +150,24 @@ def cases(robot: Robot, healthy: int, faulty: int, seed: int) -> Iterator[Case]:
                 yield Case(mode, motor, seed + 1000 * (motor + 1) + n)
 
 
+LEAST_TIMES, MOST_TIMES = 2.0, 4.0
+"""Errors, in the smallest that is seen."""
+
+
 def smallest_seen(robot: Robot, motion: Path, seed: int) -> FloatArray:
-    """Return the smallest error of each motor that a motion shows, (motor,) [rad]; NaN: none."""
+    """Return the smallest error of each motor that a motion shows, (motor,) [rad].
+
+    NaN: none, or larger ones would be beyond all that is considered.
+    """
     time = as_floats(STEP_S * np.arange(round(DURATION_S / STEP_S) + 1))
     made = [motion(robot, time, np.random.default_rng([seed, n])) for n in range(MOTIONS_TRIED)]
     onset = 0.0 if len(made[0][1]) else float(np.mean(ONSET_OF_CURVES)) * DURATION_S
     names = [f"{motor}:steady_state_error" for motor in robot.motor_names]
     commands = np.stack([command for command, _ in made])
-    found = ft.isolability(robot, commands, time, "generic", names, onset_s=onset).detected
-    return np.array([np.nan if found[name] is None else found[name] for name in names])
+    found = ft.isolability(robot, commands, time, "generic", names, onset_s=onset)
+    sizes = np.array([np.nan if found.detected[n] is None else found.detected[n] for n in names])
+    largest = np.array([found.largest[name] for name in names])
+    return np.where(MOST_TIMES * sizes <= largest, sizes, np.nan)
 
 
 @dataclass(frozen=True)
@@ -242,10 +251,14 @@ def _direction(speed: FloatArray) -> FloatArray:
 def _errors(
     time: FloatArray, strokes: FloatArray, onset: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Return errors, (time,), two to four times what can be seen: of each stroke, or of a curve."""
+    """Return errors, (time,), in the smallest that is seen: of each stroke, or of a curve."""
     if not len(strokes):
-        return np.where(time >= onset, rng.uniform(2.0, 4.0) * rng.choice([-1.0, 1.0]), 0.0)
-    size = rng.uniform(2.0, 4.0, len(strokes)) * rng.choice([-1.0, 1.0], len(strokes))
+        return np.where(
+            time >= onset, rng.uniform(LEAST_TIMES, MOST_TIMES) * rng.choice([-1.0, 1.0]), 0.0
+        )
+    size = rng.uniform(LEAST_TIMES, MOST_TIMES, len(strokes)) * rng.choice(
+        [-1.0, 1.0], len(strokes)
+    )
     return np.interp(time, strokes, size)
 
 
