@@ -161,7 +161,7 @@ def smallest_seen(robot: Robot, motion: Path, seed: int) -> FloatArray:
     """
     time = as_floats(STEP_S * np.arange(round(DURATION_S / STEP_S) + 1))
     made = [motion(robot, time, np.random.default_rng([seed, n])) for n in range(MOTIONS_TRIED)]
-    onset = 0.0 if len(made[0][1]) else float(np.mean(ONSET_OF_CURVES)) * DURATION_S
+    onset = 0.0 if motion is blended else float(np.mean(ONSET_OF_CURVES)) * DURATION_S
     names = [f"{motor}:steady_state_error" for motor in robot.motor_names]
     commands = np.stack([command for command, _ in made])
     found = ft.isolability(robot, commands, time, "generic", names, onset_s=onset)
