@@ -77,7 +77,8 @@ def differences(model, base, direction, step=1e-5):
 def found_columns(model, base, direction):
     pose = model.settle(base, direction, np.zeros(4, dtype=bool))
     still = np.zeros_like(pose)
-    return columns(model, pose, Motion(direction, still, still), Layout(4, geometry=False))
+    shown, motion = model.sensors.expected(pose), Motion(direction, still, still)
+    return columns(model, pose, shown, motion, Layout(4, geometry=False))
 
 
 def test_columns_are_the_derivative_of_where_the_tool_is_seen(twin):

@@ -159,7 +159,13 @@ def test_a_folder_learns_frames(misbuilt):
     low, high = np.array([motor.movement_range for motor in robot.motors]).T
     pose = np.random.default_rng(5).uniform(low, high, (200, len(low)))
     still = np.zeros_like(pose)
-    G = columns(model, pose, Motion(still, still, still), layout_of(model.without_doubt))
+    G = columns(
+        model,
+        pose,
+        model.sensors.expected(pose),
+        Motion(still, still, still),
+        layout_of(model.without_doubt),
+    )
     off = ft.DigitalTwin(built).path(pose) - ft.DigitalTwin(robot).path(pose)
     left = off - G @ found.mean
     assert np.sqrt(np.mean(left**2)) < 0.5 * np.sqrt(np.mean(off**2))

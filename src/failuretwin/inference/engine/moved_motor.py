@@ -199,10 +199,10 @@ class MovedMotor:
             np.broadcast_to(np.where(held, 0.0, values[:, None]), pose.shape)
             for values in (moments.speed, moments.bend, moments.late, moments.bent)
         )
-        spread, *beside = (np.swapaxes(values, 1, 2) for values in (pose, late, bent))
-        outcomes = Outcomes.of_poses(scene.model, moments, spread, self.variance, *beside)
-        G = columns(scene.model, pose, Motion(direction, speed, bend), scene.layout)
-        jacobian = scene.model.sensors.expected(pose[:, :, :, 0])[1]
+        shown = scene.model.sensors.expected(pose)
+        value, jacobian, *beside = (np.swapaxes(x, 1, 2) for x in (*shown, late, bent))
+        outcomes = Outcomes.of_poses(moments, (value, jacobian), self.variance, *beside)
+        G = columns(scene.model, pose, shown, Motion(direction, speed, bend), scene.layout)
         if self.held:
             G[..., scene.layout.own(motor)] = 0.0
         weight = np.broadcast_to(moments.log_weight[:, None], pose.shape[:-1])
@@ -213,7 +213,7 @@ class MovedMotor:
             weight,
             np.arange(weight.shape[-1]),
             G,
-            jacobian[..., motor] * self.slope(x, ARRIVED)[..., None],
+            shown[1][:, :, :, 0, :, motor] * self.slope(x, ARRIVED)[..., None],
             x,
             variance,
             amount_prior,

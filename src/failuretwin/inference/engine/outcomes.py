@@ -18,7 +18,7 @@ import numpy as np
 from failuretwin.core.compiled import compiled
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.engine.moments import Moments
-from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.engine.theta import Shown
 
 
 def seen_variance(jacobian: FloatArray, variance: FloatArray) -> FloatArray:
@@ -68,9 +68,8 @@ class Outcomes:
     @classmethod
     def of_poses(
         cls,
-        model: HealthyModel,
         moments: Moments,
-        pose: FloatArray,
+        shown: Shown,
         variance: FloatArray,
         late: FloatArray,
         beside: FloatArray,
@@ -78,14 +77,13 @@ class Outcomes:
         """Return the outcomes of some poses.
 
         Args:
-            model: The healthy robot.
             moments: The moments.
-            pose: Settled angles, (run, moment, ..., motor) [rad].
+            shown: What the sensors show of them, (run, moment, ...).
             variance: Of the scatter of each motor, (..., motor) [rad2].
-            late: By uneven starts, same axes as `pose` [rad2].
+            late: By uneven starts, (run, moment, ..., motor) [rad2].
             beside: Variance of single motors beside these, same axes [rad2].
         """
-        expected, jacobian = model.sensors.expected(pose)
+        expected, jacobian = shown
         point = moments.point
         between = expected.ndim - point.ndim
         point = point.reshape(*point.shape[:2], *(1,) * between, point.shape[-1])

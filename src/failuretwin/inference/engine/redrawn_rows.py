@@ -92,7 +92,7 @@ def _nodes(scene: Scene, motor: int, size: FloatArray, width: FloatArray) -> Out
     )
     beside[..., motor] += width**2 / 12.0
     pose = model.settle(base, direction, model.none_held)
-    return Outcomes.of_poses(model, moments, pose, model.scatter**2, late, beside)
+    return Outcomes.of_poses(moments, model.sensors.expected(pose), model.scatter**2, late, beside)
 
 
 def _beside_losses(scene: Scene, motor: int, mean_square: float, fourth: float) -> Outcomes:
@@ -106,11 +106,12 @@ def _beside_losses(scene: Scene, motor: int, mean_square: float, fourth: float) 
     late, beside = moments.late[:, :, 1:], moments.bent[:, :, 1:]
     beside[..., motor] += mean_square
     pose = scene.pose[:, :, 1:]
-    found = Outcomes.of_poses(model, moments, pose, model.scatter**2, late, beside)
+    middle, jacobian = (values[:, :, 1:] for values in scene.shown)
+    found = Outcomes.of_poses(moments, (middle, jacobian), model.scatter**2, late, beside)
     off = np.zeros_like(pose)
     off[..., motor] = np.sqrt(mean_square) * moments.done[:, :, None, motor]
-    middle, *ends = (model.sensors.expected(pose + step)[0] for step in (0.0, off, -off))
-    bend = 0.5 * (ends[0] + ends[1]) - middle
+    above, below = (model.sensors.expected(pose + step)[0] for step in (off, -off))
+    bend = 0.5 * (above + below) - middle
     spread = (fourth / mean_square**2 - 1.0) * bend[..., :, None] * bend[..., None, :]
     return replace(found, residual=found.residual - bend, beside=found.beside + spread)
 

@@ -17,7 +17,7 @@ from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.inference.engine.integral import Noise
 from failuretwin.inference.engine.moments import Moments
 from failuretwin.inference.engine.outcomes import Outcomes
-from failuretwin.inference.engine.theta import Layout, Motion, columns
+from failuretwin.inference.engine.theta import Layout, Motion, Shown, columns
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
@@ -73,6 +73,7 @@ class Scene:
         columns: G of a healthy robot under each outcome, (run, moment, outcome, channel, theta).
         spread: G V G^T where every command arrives, (run, moment, channel, channel) [m2].
         pose: Settled angles under each outcome, (run, moment, outcome, motor) [rad].
+        shown: What the sensors show of these, (run, moment, outcome, ...).
         healthy: Outcomes of a healthy robot, (run, moment, outcome, ...).
     """
 
@@ -84,6 +85,7 @@ class Scene:
     columns: FloatArray
     spread: FloatArray
     pose: FloatArray
+    shown: Shown
     healthy: Outcomes
 
     @classmethod
@@ -107,12 +109,13 @@ class Scene:
         noise = Noise.of(model.settling.tail_dof, model.sensors.dims, model.outlier_log_density)
         pose = model.settle(moments.base, moments.direction, model.none_held)
         motion = Motion(moments.direction, moments.speed, moments.bend)
-        G = columns(model, pose, motion, layout)
+        shown = model.sensors.expected(pose)
+        G = columns(model, pose, shown, motion, layout)
         usual = G[:, :, 0]
         spread = usual @ covariance @ np.swapaxes(usual, -1, -2)
         beside = moments.late, moments.bent
-        healthy = Outcomes.of_poses(model, moments, pose, model.scatter**2, *beside)
-        return cls(model, moments, priors, noise, layout, G, spread, pose, healthy)
+        healthy = Outcomes.of_poses(moments, shown, model.scatter**2, *beside)
+        return cls(model, moments, priors, noise, layout, G, spread, pose, shown, healthy)
 
     @property
     def settled(self) -> FloatArray:

@@ -231,16 +231,23 @@ class Motion:
     bend: FloatArray
 
 
-def columns(model: HealthyModel, pose: FloatArray, motion: Motion, layout: Layout) -> FloatArray:
+Shown = tuple[FloatArray, FloatArray]
+"""What sensors show of poses, (..., channel) [m], and J, (..., channel, motor) [m/rad]."""
+
+
+def columns(
+    model: HealthyModel, pose: FloatArray, shown: Shown, motion: Motion, layout: Layout
+) -> FloatArray:
     """Return G at some poses, (..., channel, theta).
 
     Args:
         model: The healthy robot.
         pose: Settled angles, (..., motor) [rad].
+        shown: What the sensors show there.
         motion: How the motors move there.
         layout: Places in theta.
     """
-    value, jacobian = model.sensors.expected(pose)
+    value, jacobian = shown
     found = np.zeros((*value.shape, layout.size))
     own = model.sensors.registered
     if own is not None:
