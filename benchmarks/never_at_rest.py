@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from scipy.interpolate import CubicSpline
-from telling import nats, right
+from telling import calibration, nats, right
 
 import failuretwin as ft
 from failuretwin.core.hypothesis import Diagnosis
@@ -378,6 +378,7 @@ def main() -> None:
     if given.logs:
         of_logs(given.logs, given.share, given.calibration)
         return
+    every: list[Diagnosis] = []
     for name in given.robot:
         robot = load_robot(name)
         for motion in given.motion:
@@ -402,6 +403,9 @@ def main() -> None:
             else:
                 found = ft.diagnose(runs, robot, given.calibration)
             print(f"{name} {motion}: {line(found, clock.process_time() - began)}", flush=True)
+            every += found
+    if every:
+        print(f"all: {line(every, np.nan)}, {calibration(every, np.random.default_rng(0))}")
 
 
 if __name__ == "__main__":
