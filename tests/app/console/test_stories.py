@@ -18,6 +18,11 @@ from console_server import PASSWORD
 pytest.importorskip("selenium", reason="selenium is not installed")
 from console_person import Person
 
+TOOL_COLUMNS = """
+[tool]
+columns = ["a", "b", "c"]
+unit = "m"
+"""
 SICK, LIVE, SILENT, DOUBTED = "hall_2-arm_7", "hall_1-arm_2", "hall_1-arm_3", "hall_2-arm_8"
 
 
@@ -128,9 +133,33 @@ def test_a_log_is_imported(person):
     person.go("/import")
     person.find("//input[@type='file']").send_keys(str(ft.sample_log()))
     person.sees("motor 3 stuck at -7 deg", "Page for technicians")
+    person.sees("Not stored: no robot is named")
+    assert not person.browser.find_elements("class name", "q-uploader__file")
     page = person.find("//a[normalize-space()='Page for technicians']").get_attribute("href")
     person.browser.get(page)
     person.sees("motor 3")
+
+
+def test_a_log_that_is_refused_is_mended_in_the_page(person, tmp_path):
+    def drop(name, text):
+        (tmp_path / name).write_text(text, "utf-8")
+        person.find("//input[@type='file']").send_keys(str(tmp_path / name))
+
+    person.go("/import")
+    drop("words.txt", "hello")
+    person.sees("words.txt is no log that can be read here", "Expected a file that ends in .nc")
+    drop("broken.nc", "hello")
+    person.sees("broken.nc: cannot be read as a run set")
+    log = ft.sample_log().read_text("utf-8")
+    header, rows = log.split("\n", 1)
+    drop("week.csv", header.replace("tool_x_m,tool_y_m,tool_z_m", "a,b,c") + "\n" + rows)
+    person.sees("week.csv: needs a column map", "The field 'Columns' below holds a guess")
+    assert "--" not in person.find("//p[@role='alert']").text
+    assert "/" not in person.find("//p[@role='alert']").text
+    assert not person.browser.find_elements("class name", "q-uploader__file")
+    person.find("//textarea").send_keys(TOOL_COLUMNS)
+    person.click("Read it again")
+    person.sees("week.csv: ", "motor 3 stuck at -7 deg")
 
 
 def test_a_check_is_run_and_stopped_while_the_page_hangs(person, server):

@@ -25,7 +25,7 @@ from failuretwin.core.errors import FailureTwinError, InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.movements import find_movements
 from failuretwin.core.types import as_floats
-from failuretwin.data_knowledge.readers.read import read_runs
+from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.records.log_files import log_file
 from failuretwin.data_knowledge.records.overview import RobotGlance, StoredRun
 from failuretwin.data_knowledge.records.store import Store
@@ -194,19 +194,32 @@ class Desk:
         record = RobotRecord(self.store, name, known.robot)
         return replace(record, calibration=self.store.calibration(name))
 
-    def diagnose(self, path: Path, kind: str, name: str) -> Imported:
-        """Diagnose a log, and store the diagnoses as those of a robot; no name: store nothing.
+    def diagnose(self, path: Path, kind: str, name: str, columns: str = "") -> Imported:
+        """Diagnose a log, and store the diagnoses as those of a robot.
+
+        Args:
+            path: The log, in a folder of its own.
+            kind: Name of its profile.
+            name: Name of the robot; empty: nothing is stored.
+            columns: Map of its columns or topics (TOML); empty: their names tell.
 
         Raises:
             InputError: If it cannot be read.
             OutputError: If it cannot be stored.
         """
+        from failuretwin.app.inputs import with_map
+
         known = self.of_kind(kind, name)
         if known is None:
             raise InputError(
                 f"unknown profile {kind!r}. Expected a bundled robot or that of --robot."
             )
-        runs = read_runs(path, known.robot)
+        written = path.with_name("columns.toml") if columns else None
+        if written is not None:
+            written.write_text(columns, "utf-8")
+        options, correction = with_map(ReadOptions(), written, [path], known.robot)
+        runs = read_runs(path, known.robot, options)
+        runs = runs if correction is None else correction.runs(runs)
         diagnoses = BayesDiagnoser(known.twin, known.imperfections).diagnose(runs)
         record = self.record(name, known)
         lines: list[str] = []

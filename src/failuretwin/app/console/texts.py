@@ -132,12 +132,27 @@ GONE = "the page that started the check is closed, or hangs"
 BUSY = "A check is running. Wait for it, or stop it."
 STARTED, FINISHED = "the check of {robot} has begun", "the check is over"
 
-DROP = "Drop a log here, or choose one (.nc, .csv, .mat, .bag, .mcap)"
+DROP = "Drop a log here, or choose one ({endings})"
 DROP_LABEL = "Log file"
+READING = "Reading {name} ..."
 REFUSED = "refused: {why}"
+REJECTED = "The file is {limit}. Record a shorter log, or split it."
+OTHER_ENDING = "{name} is no log that can be read here. Expected a file that ends in {endings}."
+COLUMNS, READ_AGAIN = "Columns", "Read it again"
+FIELDS = {
+    "Add --columns MAP.toml: if that file does not exist yet, a guess is written there for you to "
+    "check.": f"The field {COLUMNS!r} below holds a guess: correct it, then read the log again.",
+    "a TOML file for --columns or in BagTopics in Python": f"the field {COLUMNS!r} below",
+    "--columns MAP.toml": f"the field {COLUMNS!r} below",
+    "--robot": "the field 'Profile'",
+    "columns.toml": f"field {COLUMNS!r}",
+}
+"""Fields of the page for logs, by the words of errors that mean them."""
 TOO_LARGE = "larger than {limit} MB"
 ROBOT_NAME, PROFILE = "Name of the robot in the store", "Profile"
-NOT_STORED = "Diagnosed, not stored: no robot was named, no store is open, or your role is `see`."
+NO_NAME = "Not stored: no robot is named. Fill in its name above, then drop the log again."
+NOT_BY_YOU = "Not stored: your role is {role!r}. Ask somebody whose role is 'confirm' to import it."
+NOWHERE_TO_STORE = "Not stored: no store is open. Start the console with --store."
 
 LOGIN, NAME, PASSWORD, SIGN_IN = "Sign in", "Name", "Password", "Sign in"
 WRONG = "Name or password is wrong."
