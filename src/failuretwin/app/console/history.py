@@ -12,7 +12,7 @@ from failuretwin.app.console.layout import Visit, page
 from failuretwin.app.console.users import CONFIRM
 from failuretwin.connection.fault_rates import LearnedRates
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.data_knowledge.records.episodes import CONFIRMED
 from failuretwin.data_knowledge.records.history import (
     OTHER_CAUSE,
@@ -22,6 +22,7 @@ from failuretwin.data_knowledge.records.history import (
 )
 from failuretwin.data_knowledge.records.offsets import Drift
 from failuretwin.data_knowledge.records.store import Store
+from failuretwin.inference.explanation import plain_name
 
 LONGEST = 200
 """Length of a name, note, cause or part [letters]."""
@@ -174,7 +175,15 @@ class HistoryPage:
         seen, ages = self._store.fleet_faults(kind), self._store.motor_ages(self._name)
         learned = LearnedRates.of(seen, paper_hypotheses(known.robot.motor_names), ages)
         draw.text(learned.line)
-        rows = [[one.name, str(one.confirmed), f"{one.factor:.2f}"] for one in learned.rates]
+        draw.text(texts.RATE_NOTE).classes("soft")
+        rows = [
+            [
+                *(plain_name(Hypothesis.parse(one.name)), one.ages, str(one.confirmed)),
+                *(f"{one.hours / 24.0:.0f}", f"{1000.0 * one.mean_per_h:.2g}"),
+                f"{one.factor:.2f}",
+            ]
+            for one in learned.rates
+        ]
         draw.table(texts.RATE_COLUMNS, rows)
 
 

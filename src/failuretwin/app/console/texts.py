@@ -109,7 +109,14 @@ FILL_IN = "Fill in the field {label!r} first."
 CONFIRM, REJECT, OTHER, UNDO = "Confirm", "Reject", "Other cause", "Undo"
 NOTE_REPAIR, REPAIR, UNDO_REPAIR = "Note a repair", "Repair", "Undo its last repair"
 RATES = "Learned rates of faults"
-RATE_COLUMNS = ("Fault", "Confirmed", "Times the assumed rate")
+RATE_NOTE = (
+    "All robots of this kind teach a rate, while their motor is about as old as that of this "
+    "robot. Age counts from the last repair, else from the first run."
+)
+RATE_COLUMNS = (
+    *("Fault", "Age of the motor", "Confirmed at this age", "Days at this age"),
+    *("Rate in 1000 h", "Times the assumed rate"),
+)
 COMPARE, THEN, NOW = "Compare two dates", "Then", "Now"
 OFFSET, CHANGE = "Offset", "Change"
 NO_OFFSETS = "No offsets are stored. `check` and `diagnose --track` store them."
