@@ -124,7 +124,7 @@ def test_a_fault_that_act_finds_begins_an_episode_and_a_short_task_clears_none(r
     told = run(*words, "--fault", "motor_3:stuck=-0.4")
     (episode,) = store.history("arm_7").episodes
     assert (episode.motor, episode.mode, episode.state) == ("motor_3", "stuck", "raised")
-    assert "episode 1: motor_3 stuck, raised, since" in told.stdout
+    assert "episode 1: motor 3 stuck, raised, since" in told.stdout
     alarms = [text for text in texts(store.history("arm_7"), "act") if text.startswith("ALARM")]
     assert alarms
     assert all("motor 3 stuck at -2" in text for text in alarms)

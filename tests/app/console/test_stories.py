@@ -46,7 +46,7 @@ def test_a_wrong_password_lets_nobody_in(person):
 
 def test_the_right_one_shows_the_wall_with_the_sick_robot_first(person):
     person.sign_in("ada", PASSWORD)
-    person.sees(SICK, "motor_3: stuck", "signed in as ada (move)")
+    person.sees(SICK, "motor 3 stuck", "signed in as ada (move)")
     first = person.find("//ul[@class='wall']/li[1]").text
     assert SICK in first
     assert "alarm" in first

@@ -9,10 +9,12 @@ from nicegui import ui
 
 from failuretwin.app.console import draw, texts
 from failuretwin.app.console import state as shown
-from failuretwin.app.console.state import Trace
+from failuretwin.app.console.state import Clock, Trace
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
+from failuretwin.inference.explanation import plain_name
 
 MOST_POINTS = 600
 """Points of a chart."""
@@ -39,7 +41,11 @@ def posterior_lines(trace: Trace, since_s: float) -> list[Line]:
     names = [name for name in sorted(most, key=lambda n: -most[n]) if most[name] >= INTERESTING]
     time = np.array([at for at, _ in kept])
     return [
-        (name, time, np.array([posterior.get(name, np.nan) for _, posterior in kept]))
+        (
+            plain_name(Hypothesis.parse(name)),
+            time,
+            np.array([posterior.get(name, np.nan) for _, posterior in kept]),
+        )
         for name in names[:MOST_LINES]
     ]
 
@@ -49,7 +55,7 @@ def residual_lines(trace: Trace, arm: InverseKinematics, since_s: float) -> list
     rows = np.flatnonzero((trace.time >= since_s) & np.isfinite(trace.measured).all(axis=1))
     rows = rows[:: max(1, len(rows) // RESIDUAL_POINTS)]
     value = 1e3 * shown.residuals(arm, trace.command[rows], trace.measured[rows])
-    names = [*arm.robot.motor_names, texts.TOTAL]
+    names = [*map(draw.spoken, arm.robot.motor_names), texts.TOTAL]
     return [(name, trace.time[rows], one) for name, one in zip(names, value.T, strict=True)]
 
 
@@ -73,25 +79,31 @@ class Chart:
         axis: Settings of the vertical axis.
     """
 
-    def __init__(self, title: str, note: str = "", **axis: float) -> None:
+    def __init__(
+        self, title: str, note: str = "", clock: Clock | None = None, **axis: float
+    ) -> None:
         draw.heading(title)
         if note:
             draw.text(note).classes("soft")
-        self._title, self._axis = title, axis
+        self._title, self._clock, self._axis = title, clock, axis
         self._chart: ui.echart | None = None
         self._place = ui.element("div").classes("chart")
         draw.later(self._load)
 
     def _load(self) -> None:
         grid = {"lineStyle": {"color": GRID}}
-        label = {"axisLabel": {"color": LABEL}, "splitLine": grid, "axisLine": grid}
+        label = {
+            "axisLabel": {"color": LABEL, "hideOverlap": True},
+            "splitLine": grid,
+            "axisLine": grid,
+        }
         axis: dict[str, Any] = {"type": "value", "scale": True, **label}
         options = {
             "animation": False,
             "color": COLOURS,
             "legend": {"top": 0, "itemWidth": 14, "itemGap": 8, "textStyle": {"color": LABEL}},
-            "grid": {"left": 45, "right": 15, "top": 50, "bottom": 25},
-            "xAxis": {**axis, "min": "dataMin", "max": "dataMax"},
+            "grid": {"left": 45, "right": 25, "top": 50, "bottom": 25},
+            "xAxis": {**axis, "type": "time"} if self._clock else {**axis, "name": "s"},
             "yAxis": {**axis, **self._axis},
             "series": [],
         }
@@ -102,12 +114,20 @@ class Chart:
     def show(self, lines: list[Line]) -> None:
         """Draw lines."""
         if self._chart is not None:
-            self._chart.options["series"] = _series(lines)
+            self._chart.options["series"] = _series([
+                (name, self._across(time), value) for name, time, value in lines
+            ])  # fmt: skip
+
+    def _across(self, time: FloatArray) -> FloatArray:
+        """Return times [s] as they are drawn: seconds, or milliseconds since 1970."""
+        clock = self._clock
+        return time if clock is None else 1e3 * (clock.start + clock.pace * time)
 
     def mark(self, at: float) -> None:
         """Mark a time [s] with a line."""
+        across = round(float(self._across(np.array(at))), 2)
         line = {"silent": True, "symbol": "none", "label": {"show": False}, "animation": False}
-        told = {"series": [{"markLine": {**line, "data": [{"xAxis": round(at, 2)}]}}]}
+        told = {"series": [{"markLine": {**line, "data": [{"xAxis": across}]}}]}
         if self._chart is not None:
             self._chart.run_chart_method("setOption", told)
 
@@ -137,11 +157,14 @@ def _series(lines: list[Line]) -> list[dict[str, Any]]:
 class Charts:
     """Residuals and tool path of a trace, and its probabilities where they are known."""
 
-    def __init__(self, known: CalibratedRobot, with_posterior: bool) -> None:
+    def __init__(
+        self, known: CalibratedRobot, clock: Clock | None, *, with_posterior: bool
+    ) -> None:
         self._known, self._arm = known, InverseKinematics.of(known.robot)
-        self._posterior = Chart(texts.POSTERIOR, min=0.0, max=1.0) if with_posterior else None
-        self._residuals = Chart(texts.RESIDUALS, texts.RESIDUAL_NOTE)
-        self._tool = Chart(texts.TOOL, texts.TOOL_NOTE)
+        ends = {"min": 0.0, "max": 1.0}
+        self._posterior = Chart(texts.POSTERIOR, "", clock, **ends) if with_posterior else None
+        self._residuals = Chart(texts.RESIDUALS, texts.RESIDUAL_NOTE, clock)
+        self._tool = Chart(texts.TOOL, texts.TOOL_NOTE, clock)
 
     def show(self, trace: Trace, since_s: float) -> None:
         """Draw a trace from a time on."""

@@ -17,6 +17,7 @@ import numpy as np
 from failuretwin.app.console import state as shown
 from failuretwin.app.console import texts
 from failuretwin.app.console.checking import CheckRun
+from failuretwin.app.console.draw import spoken
 from failuretwin.app.console.live import LiveRobot
 from failuretwin.app.console.state import Tile, Trace
 from failuretwin.app.remembering import RobotRecord
@@ -307,7 +308,9 @@ class Desk:
         model = HealthyModel(known.twin, known.imperfections)
         lives = motor_lives(rows, model, np.random.default_rng(0))
         few = texts.TOO_FEW.format(least=LEAST_RUNS)
-        return [f"{motor}: {life.verdict if life else few}" for motor, life in lives.items()]
+        return [
+            f"{spoken(motor)}: {life.verdict if life else few}" for motor, life in lives.items()
+        ]
 
 
 def has_log(run: StoredRun) -> bool:

@@ -14,8 +14,9 @@ from failuretwin.app.console.arm import ArmScene
 from failuretwin.app.console.charts import Charts
 from failuretwin.app.console.desk import has_log
 from failuretwin.app.console.layout import Visit, page
-from failuretwin.app.console.live import LiveRobot
+from failuretwin.app.console.live import STATES, LiveRobot
 from failuretwin.app.console.state import LiveView, Tile
+from failuretwin.connection.links.base import OK
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import printable
 from failuretwin.core.hypothesis import Diagnosis
@@ -119,7 +120,7 @@ class ReachPart:
         draw.heading(texts.REACH)
         with ui.row().classes("items-end gap-4"):
             motors = known.robot.motor_names
-            self._motor = draw.Choice(["", *motors], motor, texts.MOTOR)
+            self._motor = draw.Choice(["", *motors], motor, texts.MOTOR, words=draw.spoken)
             words = texts.ANGLE.format(unit=visit.unit_of(known.robot))
             at = motors.index(motor) if motor else 0
             start = visit.angle(angle, known.robot, at).split()[0]
@@ -136,7 +137,9 @@ class ReachPart:
         said = texts.ALL_REACHED.format(share=found.share)
         if found.motor:
             words = self._visit.angle(found.angle, robot, robot.motor_names.index(found.motor))
-            said = texts.REACHED.format(share=found.share, motor=found.motor, angle=words)
+            said = texts.REACHED.format(
+                share=found.share, motor=draw.spoken(found.motor), angle=words
+            )
         self._line.set_text(said)
         if self._scene is None:
             with self._place:
@@ -163,7 +166,9 @@ def held_angle(visit: Visit, robot: Robot, motor: str, told: float | None) -> fl
     angle, (low, high) = visit.held(float(told), robot, at), robot.travel[at].tolist()
     if not low - ROUNDED <= angle <= high + ROUNDED:
         ends = (visit.angle(end, robot, at) for end in (low, high))
-        raise InputError(texts.OUT_OF_RANGE.format(motor=motor, low=next(ends), high=next(ends)))
+        raise InputError(
+            texts.OUT_OF_RANGE.format(motor=draw.spoken(motor), low=next(ends), high=next(ends))
+        )
     return angle
 
 
@@ -212,7 +217,7 @@ class LivePage:
                 ui.link(texts.REPLAY_LIVE, draw.link_to("replay", name=live.settings.name, run=0))
             self._verdict = ui.element("section").props('aria-live="polite"')
             with ui.element("section"):
-                self._charts = Charts(self._known, with_posterior=True)
+                self._charts = Charts(self._known, live.clock, with_posterior=True)
             with ui.element("section"):
                 draw.heading(texts.CHANGES)
                 self._changes = ui.element("div")
@@ -271,28 +276,28 @@ class LivePage:
             draw.heading(texts.MOTORS)
             rows = [
                 [
-                    one.name,
-                    one.state,
+                    draw.spoken(one.name),
+                    texts.STATES[STATES[one.state]],
                     percent(float(one.values.get("probability", 0))),
-                    words(one.message, robot),
+                    "" if one.state == OK else one.values.get("mode", "").replace("_", " "),
                 ]
                 for one in view.statuses[1:]
             ]
-            draw.table((texts.MOTOR, texts.STATE, texts.PROBABILITY, texts.SAYS), rows)
+            draw.table((texts.MOTOR, texts.STATE, texts.PROBABILITY, texts.FAULT), rows)
         self._changes.clear()
         with self._changes:
             for change in reversed(view.changes):
-                draw.text(words(str(change), robot))
+                draw.text(words(change, robot))
 
     def _say_alarm(self, view: LiveView) -> None:
-        episode, sample = view.alarm.episode, view.sample
-        if episode is None or episode.cleared_s is not None or sample is None:
+        episode = view.alarm.episode
+        if episode is None or episode.cleared_s is not None:
             return
-        raised = datetime.fromtimestamp(sample.read - (sample.time - episode.raised_s), UTC)
-        when = self._visit.time(raised, seconds=True)
-        draw.text(texts.ALARM_SINCE.format(time=when, number=episode.number))
+        told = texts.ALARM_SINCE.format(time=self._live.at(episode.raised_s), number=episode.number)
+        draw.text(self._visit.words(told, self._known.robot))
 
     def _link(self, reason: str, at: float) -> None:
         """Draw a link to a time [s]: unlike a button, it works while all is drawn anew."""
         address = draw.link_to("replay", name=self._live.settings.name, run=0, at=f"{at:.2f}")
-        ui.link(printable(reason), address).classes("reason")
+        link = ui.link(printable(reason), address).classes("reason")
+        link.props(f'name="{reason.partition(":")[0]}"')  # kept in focus while its figures change

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from failuretwin.app.console import texts
-from failuretwin.app.shadow import Change
 from failuretwin.connection.links.statuses import Status
 from failuretwin.core.foreign import printable
 from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, Alarm, Diagnosis, Hypothesis
@@ -18,12 +17,14 @@ from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.records import CHECK_DAYS
 from failuretwin.data_knowledge.records.overview import RobotGlance
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
-from failuretwin.inference.explanation import set_up_doubt
+from failuretwin.inference.explanation import plain_name, set_up_doubt
 
 ALARM, SUSPECTED, SET_UP, UNDECIDED, STALE, WAITING, HEALTHY = texts.STATES
 WORST_FIRST = (ALARM, SUSPECTED, SET_UP, UNDECIDED, STALE, WAITING, HEALTHY)
 SUSPECT = 0.05
 """Probability from which the drawn arm lets a motor differ from its command."""
+STAMP = "%Y-%m-%dT%H:%M:%SZ"
+"""Form of times (UTC) in texts, which pages show in the zone of their reader."""
 LONGEST_TEXT = 300
 """Length to which texts from logs are cut [letters]."""
 
@@ -118,7 +119,7 @@ class LiveView:
         statuses: Status of the arm, then of each motor.
         diagnosis: The diagnosis; None: none yet.
         alarm: The alarm.
-        changes: The last changes, the newest last.
+        changes: The last changes with their times, the newest last.
     """
 
     tile: Tile
@@ -127,7 +128,24 @@ class LiveView:
     statuses: Sequence[Status]
     diagnosis: Diagnosis | None
     alarm: Alarm
-    changes: Sequence[Change]
+    changes: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Time of day of a stream: `start` + `pace` t [s since 1970], with its own time t [s]."""
+
+    start: float
+    pace: float
+
+    def stamp(self, at: float) -> str:
+        """Return a time of the stream [s] as a time of day (UTC)."""
+        return f"{datetime.fromtimestamp(self.start + self.pace * at, UTC):{STAMP}}"
+
+
+def moment(clock: Clock | None, at: float) -> str:
+    """Return a time of a stream [s] in words: the time of day where it is known."""
+    return texts.STREAM_TIME.format(time=at) if clock is None else clock.stamp(at)
 
 
 @dataclass(frozen=True)
@@ -143,6 +161,7 @@ class Trace:
         diagnosis: Diagnosis of it; None: none.
         posterior: Times [s] and probabilities of hypotheses; empty: not followed over time.
         first: Number of the first of the movements.
+        clock: Time of day of its time; None: it was recorded some time.
     """
 
     name: str
@@ -153,6 +172,7 @@ class Trace:
     diagnosis: Diagnosis | None
     posterior: Sequence[tuple[float, Mapping[str, float]]] = ()
     first: int = 1
+    clock: Clock | None = None
 
 
 def worst_first(tiles: Sequence[Tile]) -> list[Tile]:
@@ -169,7 +189,7 @@ def modes_of(names: Sequence[str]) -> str:
 def stored_tile(glance: RobotGlance, now: datetime) -> Tile:
     """Return a robot of the store. A robot without a run for `CHECK_DAYS` is stale."""
     said = "; ".join(
-        f"{name.replace(':', ': ')}{' (confirmed)' if confirmed else ''}"
+        f"{plain_name(Hypothesis.parse(name))}{' (confirmed)' if confirmed else ''}"
         for name, confirmed in glance.faults.items()
     )
     said = said or glance.verdict
