@@ -79,13 +79,12 @@ class Chart:
         axis: Settings of the vertical axis.
     """
 
-    def __init__(
-        self, title: str, note: str = "", clock: Clock | None = None, **axis: float
-    ) -> None:
+    def __init__(self, title: str, note: str = "", **axis: float) -> None:
         draw.heading(title)
         if note:
             draw.text(note).classes("soft")
-        self._title, self._clock, self._axis = title, clock, axis
+        self._title, self._axis = title, axis
+        self._clock: Clock | None = None
         self._chart: ui.echart | None = None
         self._place = ui.element("div").classes("chart")
         draw.later(self._load)
@@ -103,7 +102,7 @@ class Chart:
             "color": COLOURS,
             "legend": {"top": 0, "itemWidth": 14, "itemGap": 8, "textStyle": {"color": LABEL}},
             "grid": {"left": 45, "right": 25, "top": 50, "bottom": 25},
-            "xAxis": {**axis, "type": "time"} if self._clock else {**axis, "name": "s"},
+            "xAxis": {**axis, "name": "s"},
             "yAxis": {**axis, **self._axis},
             "series": [],
         }
@@ -111,9 +110,12 @@ class Chart:
             chart = ui.echart(options).classes("full")
         self._chart = chart.props(f'role="img" aria-label="{self._title}"')
 
-    def show(self, lines: list[Line]) -> None:
-        """Draw lines."""
+    def show(self, lines: list[Line], clock: Clock | None) -> None:
+        """Draw lines, over the time of day where it is known."""
+        self._clock = clock
         if self._chart is not None:
+            if clock is not None:
+                self._chart.options["xAxis"] |= {"type": "time", "name": ""}
             self._chart.options["series"] = _series([
                 (name, self._across(time), value) for name, time, value in lines
             ])  # fmt: skip
@@ -157,21 +159,18 @@ def _series(lines: list[Line]) -> list[dict[str, Any]]:
 class Charts:
     """Residuals and tool path of a trace, and its probabilities where they are known."""
 
-    def __init__(
-        self, known: CalibratedRobot, clock: Clock | None, *, with_posterior: bool
-    ) -> None:
+    def __init__(self, known: CalibratedRobot, with_posterior: bool) -> None:
         self._known, self._arm = known, InverseKinematics.of(known.robot)
-        ends = {"min": 0.0, "max": 1.0}
-        self._posterior = Chart(texts.POSTERIOR, "", clock, **ends) if with_posterior else None
-        self._residuals = Chart(texts.RESIDUALS, texts.RESIDUAL_NOTE, clock)
-        self._tool = Chart(texts.TOOL, texts.TOOL_NOTE, clock)
+        self._posterior = Chart(texts.POSTERIOR, min=0.0, max=1.0) if with_posterior else None
+        self._residuals = Chart(texts.RESIDUALS, texts.RESIDUAL_NOTE)
+        self._tool = Chart(texts.TOOL, texts.TOOL_NOTE)
 
     def show(self, trace: Trace, since_s: float) -> None:
         """Draw a trace from a time on."""
-        self._residuals.show(residual_lines(trace, self._arm, since_s))
-        self._tool.show(tool_lines(trace, self._known, since_s))
+        self._residuals.show(residual_lines(trace, self._arm, since_s), trace.clock)
+        self._tool.show(tool_lines(trace, self._known, since_s), trace.clock)
         if self._posterior is not None:
-            self._posterior.show(posterior_lines(trace, since_s))
+            self._posterior.show(posterior_lines(trace, since_s), trace.clock)
 
     def mark(self, at: float) -> None:
         """Mark a time [s]."""

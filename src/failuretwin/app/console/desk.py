@@ -27,6 +27,7 @@ from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.movements import find_movements
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
+from failuretwin.data_knowledge.records.history import FaultEpisode
 from failuretwin.data_knowledge.records.log_files import log_file
 from failuretwin.data_knowledge.records.overview import RobotGlance, StoredRun
 from failuretwin.data_knowledge.records.store import Store
@@ -119,7 +120,10 @@ class Desk:
         kinds = {name: tile.kind for name, tile in found.items()}
         for tile in self._fleet:
             found[tile.name] = replace(tile, kind=kinds.get(tile.name, tile.kind))
-        found |= {name: robot.tile for name, robot in self.live.items()}
+        faults = {one.robot: one.faults for one in self._glances}
+        found |= {
+            name: robot.tile.alarmed(faults.get(name, {})) for name, robot in self.live.items()
+        }
         return shown.worst_first(list(found.values()))
 
     @property
@@ -251,6 +255,11 @@ class Desk:
         """Return the faults of the open episodes of a robot in the store, ``MOTOR:MODE``."""
         glance = self._glance(name)
         return [] if glance is None else list(glance.faults)
+
+    def open_episodes(self, name: str) -> list[FaultEpisode]:
+        """Return the open episodes of a robot in the store."""
+        store = self.store if self._glance(name) is not None else None
+        return [] if store is None else store.history(name).open_episodes
 
     def _glance(self, name: str) -> RobotGlance | None:
         return next((one for one in self._glances if one.robot == name), None)

@@ -69,7 +69,7 @@ class Replay:
                 blind = texts.BLIND, texts.ASK_BLIND
                 parts.asked(visit, known.robot, blind, lambda: visit.desk.blind_spots(trace, known))
             with ui.element("section"):
-                self._charts = Charts(known, trace.clock, with_posterior=bool(trace.posterior))
+                self._charts = Charts(known, with_posterior=bool(trace.posterior))
                 draw.later(self._draw_charts)
         self._marked = -np.inf
         self._move()

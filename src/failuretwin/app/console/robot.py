@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from datetime import UTC, datetime
 
 import numpy as np
@@ -217,7 +218,7 @@ class LivePage:
                 ui.link(texts.REPLAY_LIVE, draw.link_to("replay", name=live.settings.name, run=0))
             self._verdict = ui.element("section").props('aria-live="polite"')
             with ui.element("section"):
-                self._charts = Charts(self._known, live.clock, with_posterior=True)
+                self._charts = Charts(self._known, with_posterior=True)
             with ui.element("section"):
                 draw.heading(texts.CHANGES)
                 self._changes = ui.element("div")
@@ -257,8 +258,10 @@ class LivePage:
 
     def _say(self) -> None:
         """Tell the verdict, unless it stands there."""
-        view, tile = self._live.view, self._live.tile
-        said = (tile.state, tile.said, view.diagnosis, len(view.changes))
+        view, desk = self._live.view, self._visit.desk
+        tile = desk.tile(self._live.settings.name) or view.tile
+        alarms = desk.open_faults(tile.name)
+        said = (tile.state, tile.said, view.diagnosis, view.changes, alarms)
         if said == self._said:
             return
         self._said, words, robot = said, self._visit.words, self._known.robot
@@ -268,11 +271,12 @@ class LivePage:
             draw.badges(tile.states)
             draw.text(words(tile.said, robot))
             self._say_alarm(view)
+            self._say_stored(alarms)
             if view.diagnosis is not None:
                 trace = self._live.trace()
                 parts.reasons(self._visit, view.diagnosis, trace, robot, self._link)
             if view.diagnosis is not None or tile.state == shown.STALE:
-                parts.next_steps(self._visit, robot, tile, view.diagnosis)
+                parts.next_steps(self._visit, robot, tile, view.diagnosis, alarms)
             draw.heading(texts.MOTORS)
             rows = [
                 [
@@ -295,6 +299,15 @@ class LivePage:
             return
         told = texts.ALARM_SINCE.format(time=self._live.at(episode.raised_s), number=episode.number)
         draw.text(self._visit.words(told, self._known.robot))
+
+    def _say_stored(self, alarms: Sequence[str]) -> None:
+        """Tell the open episodes of the store, each with a link to the history."""
+        name = self._live.settings.name
+        for one in self._visit.desk.open_episodes(name) if alarms else []:
+            when = self._visit.time(one.since, seconds=True)
+            said = {"time": when, "fault": one.fault, "state": one.state, "number": one.number}
+            address = draw.link_to("history", name=name)
+            ui.link(texts.STORED_SINCE.format(**said), address).classes("reason")
 
     def _link(self, reason: str, at: float) -> None:
         """Draw a link to a time [s]: unlike a button, it works while all is drawn anew."""

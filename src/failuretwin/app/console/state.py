@@ -68,6 +68,18 @@ class Tile:
         """Its state, and `SET_UP` where its set-up is uncertain besides."""
         return (self.state, SET_UP) if self.set_up and self.state != SET_UP else (self.state,)
 
+    def alarmed(self, faults: Mapping[str, bool]) -> Tile:
+        """Return a live robot with the open episodes of the store that it does not tell itself."""
+        told = open_faults({name: sure for name, sure in faults.items() if not self.tells(name)})
+        if not told:
+            return self
+        state = ALARM if self.state in (HEALTHY, UNDECIDED, SUSPECTED, WAITING) else self.state
+        return replace(self, state=state, said=texts.STILL_OPEN.format(faults=told, said=self.said))
+
+    def tells(self, fault: str) -> bool:
+        """Return whether it names a fault, ``MOTOR:MODE``."""
+        return plain_name(Hypothesis.parse(fault)) in self.said
+
     def doubted(self, set_up: str) -> Tile:
         """Return it with what is to be said of its set-up; empty: nothing."""
         if not set_up:
@@ -186,13 +198,17 @@ def modes_of(names: Sequence[str]) -> str:
     return ", ".join(sorted(found))
 
 
+def open_faults(faults: Mapping[str, bool]) -> str:
+    """Return faults of open episodes in words, given whether each is confirmed."""
+    return "; ".join(
+        f"{plain_name(Hypothesis.parse(name))}{' (confirmed)' if confirmed else ''}"
+        for name, confirmed in faults.items()
+    )
+
+
 def stored_tile(glance: RobotGlance, now: datetime) -> Tile:
     """Return a robot of the store. A robot without a run for `CHECK_DAYS` is stale."""
-    said = "; ".join(
-        f"{plain_name(Hypothesis.parse(name))}{' (confirmed)' if confirmed else ''}"
-        for name, confirmed in glance.faults.items()
-    )
-    said = said or glance.verdict
+    said = open_faults(glance.faults) or glance.verdict
     mode = modes_of(list(glance.faults))
     if glance.at is None:
         return Tile(glance.robot, glance.kind, WAITING, mode, texts.NEVER, None)

@@ -66,6 +66,8 @@ OPEN_ALARM = (
     "The alarm {fault!r} is still open, though the last run does not show this fault. Look at "
     "this motor too. Then confirm or reject the episode, or note its repair, on the history page."
 )
+STILL_OPEN = "alarm still open in the store: {faults}; now: {said}"
+STORED_SINCE = "open in the store since {time}: {fault}, {state} (episode {number})"
 OPEN_EPISODES = "Open episodes"
 VERDICT, SINCE, WHY, NEXT = "Verdict", "Since", "Why", "What to do now"
 ALARM_SINCE = "alarm number {number}, since {time}"
