@@ -95,7 +95,7 @@ def _runs(visit: Visit, name: str, robot: Robot | None) -> None:
 
     def link(words: str, page_name: str, one: StoredRun) -> draw.Cell:
         if not has_log(one):
-            return texts.NO_LOG
+            return ""
         address = draw.link_to(page_name, name=name, run=one.row)
         return lambda: ui.link(words, address).props(f'aria-label="{words}: {one.row}"')
 
@@ -110,6 +110,8 @@ def _runs(visit: Visit, name: str, robot: Robot | None) -> None:
         for one in runs
     ]
     draw.table((texts.WHEN, texts.RUN, texts.VERDICT, texts.PLAY, texts.REPORT), rows)
+    if not all(map(has_log, runs)):
+        draw.text(texts.NO_LOGS).classes("soft")
 
 
 class ReachPart:

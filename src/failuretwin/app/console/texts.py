@@ -99,7 +99,11 @@ STREAM_TIME = "{time:.1f} s"
 WORKING, NOTHING = "Working ...", "nothing"
 
 RUNS, WHEN, RUN, PLAY = "Runs", "When", "Run", "Replay"
-NO_LOG = "its log is not on this computer"
+NO_LOG = "The log of this run is not on this computer. Put it back, or import it, to replay it."
+NO_LOGS = (
+    "Runs without links have no log on this computer: they were watched or simulated, or their log "
+    "was moved. Put a log back, or import it, to replay it."
+)
 SLIDER = "Time in the run"
 REPORT = "Page for technicians"
 PAUSE = "Pause"
