@@ -120,11 +120,9 @@ def test_a_silent_robot_is_stale_with_its_last_word(person):
 def test_a_fault_arrives_live(person):
     person.go("/")
     person.find(f"//a[strong[text()='{LIVE}'] and contains(@class, 'edge-alarm')]")
-    person.picture("console_wall")
     person.press(f"//a[strong[text()='{LIVE}']]")
     person.sees("motor 3 stuck", "alarm number 1", "Probability over time", "nats for motor 3")
     person.find("//canvas")
-    person.picture("console_robot")
     person.press("//a[starts-with(normalize-space(), 'movement ')]")
     person.sees("Replay: ", "Angles")
 

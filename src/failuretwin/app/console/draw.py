@@ -138,11 +138,11 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
             with ui.element("tbody"):
                 for row in rows:
                     with ui.element("tr"):
-                        for cell in row:
-                            if isinstance(cell, str):
-                                text(cell, "td")
-                            else:
-                                with ui.element("td"):
+                        for head, cell in zip(headings, row, strict=False):
+                            place = text(cell if isinstance(cell, str) else "", "td")
+                            place.props["data-label"] = head  # beside it on narrow pages
+                            if not isinstance(cell, str):
+                                with place:
                                     cell()
 
 

@@ -181,7 +181,7 @@ class HistoryPage:
             [
                 *(plain_name(Hypothesis.parse(one.name)), one.ages, str(one.confirmed)),
                 *(f"{one.hours / 24.0:.0f}", f"{1000.0 * one.mean_per_h:.2g}"),
-                f"{one.factor:.2f}",
+                f"{one.factor:.2g}",
             ]
             for one in learned.rates
         ]

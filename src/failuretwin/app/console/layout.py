@@ -58,6 +58,12 @@ p { margin: .25rem 0; overflow-wrap: anywhere; }
 table.plain { border-collapse: collapse; width: 100%; }
 table.plain th, table.plain td { text-align: left; padding: .25rem .6rem; vertical-align: top;
   border-bottom: 1px solid var(--line); overflow-wrap: break-word; }
+table.plain td:first-child { white-space: nowrap; }
+@media (max-width: 599px) { table.plain thead { display: none; }
+  table.plain tr { display: block; border-bottom: 1px solid var(--line); padding: .3rem 0; }
+  table.plain td { display: flex; gap: .6rem; border: 0; padding: .1rem 0; }
+  table.plain td:empty { display: none; } table.plain .q-btn { margin: .2rem .3rem .2rem 0; }
+  table.plain td::before { content: attr(data-label); flex: 0 0 7rem; opacity: .85; } }
 .state { color: #fff; border-radius: .3rem; padding: 0 .5rem; display: inline-block; }
 .choice { font-size: 1rem; border: 1px solid #6b757e; border-radius: .3rem; padding: .3rem .4rem;
   background: #fff; color: #16191c; }
@@ -182,7 +188,7 @@ class Visit:
         if robot.slides[motor]:
             return f"{1e3 * value:.2f} mm"
         told, unit = self._shown(value, robot, relative=True)
-        return f"{told if directed else np.copysign(told, value):.{DIGITS[unit] + 1}f} {unit}"
+        return f"{told if directed else np.copysign(told, value):z.{DIGITS[unit] + 1}f} {unit}"
 
     def held(self, told: float, robot: Robot, motor: int) -> float:
         """Return the angle [rad] or place [m] that a number in the unit of the reader means."""

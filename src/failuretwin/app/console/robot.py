@@ -109,7 +109,8 @@ def _runs(visit: Visit, name: str, robot: Robot | None) -> None:
         ]
         for one in runs
     ]
-    draw.table((texts.WHEN, texts.RUN, texts.VERDICT, texts.PLAY, texts.REPORT), rows)
+    heads = (texts.WHEN, texts.RUN, texts.VERDICT, texts.PLAY, texts.REPORT)
+    draw.table(heads if any(map(has_log, runs)) else heads[:3], rows)
     if not all(map(has_log, runs)):
         draw.text(texts.NO_LOGS).classes("soft")
 
@@ -123,7 +124,7 @@ class ReachPart:
         draw.heading(texts.REACH)
         with ui.row().classes("items-end gap-4"):
             motors = known.robot.motor_names
-            self._motor = draw.Choice(["", *motors], motor, texts.MOTOR, words=draw.spoken)
+            self._motor = draw.Choice(["", *motors], motor, texts.MOTOR, words=_or_none)
             words = texts.ANGLE.format(unit=visit.unit_of(known.robot))
             at = motors.index(motor) if motor else 0
             start = visit.angle(angle, known.robot, at).split()[0]
@@ -149,6 +150,10 @@ class ReachPart:
                 self._scene = ArmScene(robot, texts.REACH)
             self._scene.show(robot.resting_pose, robot.resting_pose, {})
         self._scene.points(found.points, found.reached)
+
+
+def _or_none(motor: str) -> str:
+    return draw.spoken(motor) or texts.NO_MOTOR
 
 
 def _reach(visit: Visit, known: CalibratedRobot, motor: str, told: float | None) -> Reach:
@@ -218,10 +223,8 @@ class LivePage:
                 self._clock = draw.text("").classes("soft")
                 self._angles = parts.Angles(visit, robot)
                 ui.link(texts.REPLAY_LIVE, draw.link_to("replay", name=live.settings.name, run=0))
-            self._verdict = ui.element("section").props('aria-live="polite"')
             with ui.element("section"):
-                self._charts = Charts(self._known, with_posterior=True)
-            with ui.element("section"):
+                self._verdict = ui.element("div").props('aria-live="polite"')
                 draw.heading(texts.CHANGES)
                 self._changes = ui.element("div")
                 parts.asked(
@@ -230,6 +233,8 @@ class LivePage:
                     (texts.BLIND, texts.ASK_BLIND),
                     lambda: visit.desk.blind_spots(live.trace(), self._known),
                 )
+            with ui.element("section"):
+                self._charts = Charts(self._known, with_posterior=True)
         self._say()
         ui.timer(FRAME_S, self._frame)
         ui.timer(CHART_S, self._second)
