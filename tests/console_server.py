@@ -35,12 +35,15 @@ class ConsoleServer:
         folder: Folder for its users.
         options: What it shows.
         environment: Variables it has besides ours.
+        guarded: Whether people sign in.
     """
 
-    def __init__(self, folder, options=DEMO, environment=None):
+    def __init__(self, folder, options=DEMO, environment=None, guarded=True):
         pytest.importorskip("nicegui", reason="pip install 'failuretwin[console]'")
         self.port, self.process, self._folder = free_port(), None, folder
-        self._options, self._environment = options, environment or {}
+        self._options, self._environment = list(options), environment or {}
+        if guarded:
+            self._options += ["--users", "users.toml"]
         self.url = f"http://127.0.0.1:{self.port}"
         for name, role in USERS.items():
             add_user(folder / "users.toml", name, role, PASSWORD)
@@ -49,7 +52,7 @@ class ConsoleServer:
     def start(self):
         options = [*self._options, "--port", str(self.port)]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "failuretwin", "console", *options, "--users", "users.toml"],
+            [sys.executable, "-m", "failuretwin", "console", *options],
             cwd=self._folder,
             env={
                 **{k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"},

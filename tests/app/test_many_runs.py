@@ -60,7 +60,7 @@ def test_priors_that_a_store_teaches_count_as_in_memory(failuretwin, tmp_path, t
         assert told.returncode == 0, told.stderr
     found = {name: pd.read_csv(tmp_path / f"{name}.csv") for name in ("plain", "learned")}
     told = failuretwin(*learned, "--parquet", "many", folder=tmp_path)
-    assert "learned priors: 1 confirmed of 1 robot" in told.stderr
+    assert "learned priors: 1 confirmed fault of 1 robot" in told.stderr
     many = pd.read_parquet(tmp_path / "many")
     chances = [name for name in many.columns if name.startswith("p(")]
     wanted = found["learned"][chances].to_numpy()

@@ -124,11 +124,11 @@ def test_a_robot_is_followed_by_what_people_state(run, filled, tmp_path):
         "arm_7, motor_3: gear replaced\n"
     )
     told = run("history", "arm_7", *store, "--report", "page")
-    assert told.startswith("arm_7 (armpi_fpv): motor_3: stuck, confirmed, since 2026-03-02\n")
+    assert told.startswith("arm_7 (armpi_fpv): motor 3 stuck, confirmed, since 2026-03-02\n")
     for line in ("other cause, loose cable", "episode 1: confirmed, gear (Ada)", "gear replaced"):
         assert line in told
     page = (tmp_path / "page" / "index.html").read_text("utf-8")
-    assert "motor_3: stuck, confirmed" in page
+    assert "motor 3 stuck, confirmed" in page
     assert "gear replaced" in page
     withdrawn = run("found", "arm_7", 1, "--withdraw", *store)
     assert withdrawn.endswith("raised, since 2026-03-02 14:30\nfinding: none\n")
@@ -227,11 +227,11 @@ def test_a_full_disk_is_one_line(failuretwin, store, tmp_path):
 def test_the_store_of_the_environment_is_used(run, store, monkeypatch):
     monkeypatch.setenv("FAILURETWIN_STORE", "robots.db")
     assert "remembered in robots.db: 3 runs of armpi_fpv" in run("diagnose", SAMPLE, *AT, *FEW)
-    assert run("history", "armpi_fpv").startswith("armpi_fpv: motor_3: stuck, raised")
+    assert run("history", "armpi_fpv").startswith("armpi_fpv: motor 3 stuck, raised")
 
 
 def test_a_store_on_a_server_works_alike(run, postgres):
     url = postgres.place().url
     run("store", "init", "--store", url)
     run("diagnose", SAMPLE, *AT, "--store", url, *FEW)
-    assert run("history", "armpi_fpv", "--store", url).startswith("armpi_fpv: motor_3: stuck")
+    assert run("history", "armpi_fpv", "--store", url).startswith("armpi_fpv: motor 3 stuck")

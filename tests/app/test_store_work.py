@@ -124,7 +124,7 @@ def test_a_fault_that_act_finds_begins_an_episode_and_a_short_task_clears_none(r
     told = run(*words, "--fault", "motor_3:stuck=-0.4")
     (episode,) = store.history("arm_7").episodes
     assert (episode.motor, episode.mode, episode.state) == ("motor_3", "stuck", "raised")
-    assert "episode 1: motor_3 stuck, raised, since" in told.stdout
+    assert "episode 1: motor 3 stuck, raised, since" in told.stdout
     alarms = [text for text in texts(store.history("arm_7"), "act") if text.startswith("ALARM")]
     assert alarms
     assert all("motor 3 stuck at -2" in text for text in alarms)
@@ -398,7 +398,7 @@ def test_confirmed_faults_count_until_they_are_withdrawn(run, place, store, stuc
     run(*sample, "--recorded", "2026-03-02")
     run("found", "arm_7", 1, "--confirmed", "--store", place.url)
     told = run(*sample, "--recorded", "2026-03-02", "--learned-priors")
-    assert "learned priors: 1 confirmed of 1 robot (armpi_fpv) in 0 robot days; most" in told.stderr
+    assert "learned priors: 1 confirmed fault of 1 robot (armpi_fpv); most" in told.stderr
     record = json.loads((tmp_path / "found.jsonl").read_text().splitlines()[0])
     assert record["method"].endswith("; learned priors")
     run("advise", "--template", "costs.toml")
@@ -407,9 +407,9 @@ def test_confirmed_faults_count_until_they_are_withdrawn(run, place, store, stuc
     assert "learned priors: 1 confirmed" in run(*advice, "--learned-priors").stderr
     run("found", "arm_7", 1, "--withdraw", "--store", place.url)
     again = run(*sample, "--learned-priors")
-    assert "learned priors: 0 confirmed of 1 robot" in again.stderr
+    assert "learned priors: 0 confirmed faults of 1 robot" in again.stderr
     watch = ("watch", "emulated", "--speed", 0, "--seconds", 5, "--learned-priors", *words)
-    assert "learned priors: 0 confirmed of 1 robot" in run(*watch).stderr
+    assert "learned priors: 0 confirmed faults of 1 robot" in run(*watch).stderr
 
 
 @pytest.mark.parametrize("command", [("diagnose", "a.nc"), ("watch", "emulated")])

@@ -123,9 +123,9 @@ def test_reweighting_a_posterior_is_diagnosing_with_the_other_prior():
 
 def test_the_line_says_what_the_rates_rest_on():
     told = fleet(24.0 * 365.0, motor_1=12).line
-    assert told.startswith("learned priors: 12 confirmed of 31 robots (arm) in 365 robot days; ")
-    assert "most often motor_1:stuck" in told
-    assert fleet(24.0).line == "learned priors: 0 confirmed of 31 robots (arm) in 1 robot days"
+    assert told.startswith("12 confirmed faults of 31 robots (arm); ")
+    assert "most often motor 1 stuck" in told
+    assert fleet(24.0).line == "0 confirmed faults of 31 robots (arm)"
 
 
 def test_a_wrong_confirmation_in_twenty_changes_no_ranking_of_clear_evidence():

@@ -114,7 +114,7 @@ def test_the_sdk_reads_every_value_of_a_shell(place, store, robot, tmp_path, suf
     assert found["Document"] == 'x = "ä"\n'.encode()
 
     health = values(submodels["Health"])
-    assert health["Summary"] == "motor_2: stuck, raised, since 2026-03-04"
+    assert health["Summary"] == "motor 2 stuck, raised, since 2026-03-04"
     assert health["OpenFaults"] == 1
     assert health["DiagnosedRuns"] == [
         {"State": "faulty", "Runs": 2},

@@ -56,7 +56,7 @@ def test_a_watch_is_stored_as_it_happens(store, place):
         ("watch", "begins: ros1"),
         ("watch", "OK: healthy"),
         ("watch", "ALARM: stuck"),
-        ("episode", "episode 1 begins: motor_1 stuck"),
+        ("episode", "episode 1 begins: motor 1 stuck"),
         ("watch", "CLEARED: stuck"),
         ("episode", "episode 1 cleared"),
         ("watch", "ends: OK"),

@@ -96,6 +96,8 @@ def test_a_log_whose_set_up_is_uncertain_is_not_plainly_healthy():
     healthy, faulty = (replace(one, quality=(doubt,)) for one in (run("a"), faulty_run("b")))
     found = robot_state([healthy], ROBOT)
     assert found.headline == "Healthy, but its set-up is uncertain"
+    assert found.state.kind == "cannot tell"
+    assert {row.kind for row in found.motors} == {"cannot tell"}
     assert found.step.startswith("Put the set-up right first")
     assert found.step.endswith("reverse it.")
     assert robot_state([faulty], ROBOT).step.endswith(robot_state([faulty_run("b")], ROBOT).step)

@@ -22,7 +22,7 @@ def episode_line(episode: FaultEpisode) -> str:
     """Return an episode in a line."""
     until = f" until {_time(episode.until)}" if episode.until else ""
     since = f"since {_time(episode.since)}{until}"
-    return f"episode {episode.number}: {episode.motor} {episode.mode}, {episode.state}, {since}"
+    return f"episode {episode.number}: {episode.fault}, {episode.state}, {since}"
 
 
 def history_parts(history: History) -> list[Part]:

@@ -154,7 +154,7 @@ class RobotRecord:
 
         seen, ages = self.store.fleet_faults(self.profile.name), self.store.motor_ages(self.name)
         learned = LearnedRates.of(seen, hypotheses, ages)
-        tell(learned.line, err=True)
+        tell(f"learned priors: {learned.line}", err=True)
         return learned.factors
 
     def with_learned_priors(self, bayes: BayesDiagnoser) -> BayesDiagnoser:

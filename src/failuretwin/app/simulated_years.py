@@ -18,15 +18,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
-from itertools import groupby
 
 import numpy as np
 
 from failuretwin.core.errors import InputError, counted
-from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
 from failuretwin.data_knowledge.records.episodes import CONFIRMED
-from failuretwin.data_knowledge.records.history import WRONG, FaultEpisode
+from failuretwin.data_knowledge.records.history import WRONG
 from failuretwin.data_knowledge.records.log_files import LogFile
 from failuretwin.data_knowledge.records.store import Store
 from failuretwin.data_knowledge.workers import Workforce
@@ -199,41 +198,28 @@ def _write(store: Store, name: str, life: Life, years: Years) -> tuple[int, int]
     confirmed = wrong = 0
     repairs = list(life.repairs)
     judged: set[int] = set()
-    for month, some in groupby(enumerate(life.weeks), lambda item: _month(item, life)):
-        weeks = [week for _, week in some]
-        while repairs and repairs[0].at <= weeks[0].at:
+    for week in life.weeks:
+        while repairs and repairs[0].at <= week.at:
             one = repairs.pop(0)
             store.repaired(name, one.motor, person=PERSON, at=one.at)
+        run = f"check_{week.at:%Y-%m-%d}"
         done = store.remember(
-            [replace(week.diagnosis, run=f"check_{week.at:%Y-%m-%d}") for week in weeks],
+            [replace(week.diagnosis, run=run)],
             name,
-            log=LogFile(f"simulated/{name}/{month}", None, 0, weeks[-1].at),
+            log=LogFile(f"simulated/{name}/{run}", None, 0, week.at),
             profile=years.known.robot,
             command="simulate",
         )
         for episode in done.episodes:
             if episode.raised and episode.number not in judged:
                 judged.add(episode.number)
-                right = _is_true(episode, weeks)
+                right = f"{episode.motor}:{episode.mode}" == week.truth
                 verdict = CONFIRMED if right else WRONG
-                store.found(name, episode.number, verdict, person=PERSON)
+                store.found(name, episode.number, verdict, person=PERSON, at=week.at)
                 confirmed, wrong = confirmed + right, wrong + (not right)
     for one in repairs:
         store.repaired(name, one.motor, person=PERSON, at=one.at)
     return confirmed, wrong
-
-
-def _month(item: tuple[int, Week], life: Life) -> str:
-    """Return the log of a week: four weeks, or fewer where the truth changes."""
-    number, week = item
-    before = [one for one in life.repairs if one.at <= week.at]
-    return f"{number // 4}_{len(before)}_{week.truth}"
-
-
-def _is_true(episode: FaultEpisode, weeks: list[Week]) -> bool:
-    """Return whether the fault of an episode was there in one of the weeks."""
-    fault = str(Hypothesis((Fault(episode.motor, episode.mode),)))
-    return any(week.truth == fault for week in weeks)
 
 
 def last_midnight() -> datetime:

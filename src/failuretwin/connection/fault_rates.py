@@ -22,6 +22,7 @@ from scipy.stats import gamma
 from failuretwin.core.errors import counted
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
+from failuretwin.inference.explanation import plain_name
 from failuretwin.inference.faults.prior_odds import shares_of_motors
 from failuretwin.inference.together.fault_filter import RATES
 
@@ -43,12 +44,22 @@ class FaultRate:
         table_per_h: Rate of the table lambda_0 [1/h].
         confirmed: Confirmed faults n.
         hours: Robot time T [h].
+        ages_h: Lowest and highest age of the motors that these are of [h].
     """
 
     name: str
     table_per_h: float
     confirmed: int
     hours: float
+    ages_h: tuple[float, float] = (0.0, np.inf)
+
+    @property
+    def ages(self) -> str:
+        """The ages in words."""
+        low, high = (age / 24.0 for age in self.ages_h)
+        if np.isfinite(high):
+            return f"{low:.0f} to {high:.0f} days"
+        return f"from {low:.0f} days" if low else "any"
 
     @property
     def mean_per_h(self) -> float:
@@ -101,8 +112,9 @@ class LearnedRates:
         rates = []
         for name, per_h in table_rates(hypotheses).items():
             motor = name.partition(":")[0]
-            hours, confirmed = seen.at_risk(motor, (ages or {}).get(motor))
-            rates.append(FaultRate(name, per_h, confirmed.get(name, 0), hours))
+            band = seen.at_risk(motor, (ages or {}).get(motor))
+            found = band.confirmed.get(name, 0), band.hours, (band.low_h, band.high_h)
+            rates.append(FaultRate(name, per_h, *found))
         return cls(seen, rates)
 
     @property
@@ -112,16 +124,21 @@ class LearnedRates:
 
     @property
     def line(self) -> str:
-        """What they rest on, in a line."""
+        """What they rest on, in a line: the counts of the rates themselves."""
         seen, most = self.seen, max(self.rates, key=lambda rate: rate.mean_per_h, default=None)
-        of = f"{sum(seen.confirmed.values())} confirmed of {counted(seen.robots, 'robot')}"
-        told = f"learned priors: {of} ({seen.kind}) in {seen.hours / 24.0:.0f} robot days"
-        if most is None or not seen.confirmed:
+        used, every = sum(rate.confirmed for rate in self.rates), sum(seen.confirmed.values())
+        told = (
+            f"{counted(used, 'confirmed fault')} of {counted(seen.robots, 'robot')} ({seen.kind})"
+        )
+        if used < every:
+            told += f", of {every} in all: motors of the ages of this robot's count"
+        if most is None or not used:
             return told
         low, high = 1000.0 * most.interval_per_h
         return (
-            f"{told}; most often {most.name}, {1000.0 * most.mean_per_h:.2g} in 1000 h "
-            f"({low:.2g} to {high:.2g}), {most.factor:.2g} times the table's rate"
+            f"{told}; most often {plain_name(Hypothesis.parse(most.name))}, "
+            f"{1000.0 * most.mean_per_h:.2g} in 1000 h "
+            f"({low:.2g} to {high:.2g}), {most.factor:.2g} times the assumed rate"
         )
 
 

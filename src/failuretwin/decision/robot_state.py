@@ -162,8 +162,10 @@ def with_motors(posterior: Mapping[str, float], order: Sequence[str]) -> State:
 
 
 def state_of_run(diagnosis: Diagnosis, order: Sequence[str]) -> State:
-    """Return the state of one run; it is open without a verdict."""
-    return State(OPEN_STATE) if diagnosis.undecided else with_motors(diagnosis.posterior, order)
+    """Return the state of one run; it is open without a verdict, or healthy by a doubted set-up."""
+    state = State(OPEN_STATE) if diagnosis.undecided else with_motors(diagnosis.posterior, order)
+    doubted = state.kind == HEALTHY_STATE and set_up_doubt(diagnosis.quality)
+    return State(OPEN_STATE) if doubted else state
 
 
 def robot_state(
@@ -224,10 +226,11 @@ def _with_set_up(found: RobotState, doubt: str) -> RobotState:
     """Return a state that says first that its set-up is uncertain, and why; empty: it is not."""
     if not doubt:
         return found
-    headline = SET_UP_HEADLINE if found.state.kind == HEALTHY_STATE else found.headline
+    if found.state.kind == HEALTHY_STATE:
+        found = replace(found, state=State(OPEN_STATE), headline=SET_UP_HEADLINE)
     told = [SET_UP_STEP.format(doubt=doubt), found.step]
     step = " ".join(line for line in told if line != NOTHING_TO_DO)
-    return replace(found, headline=headline, step=step)
+    return replace(found, step=step)
 
 
 def _no_verdict(diagnoses: Sequence[Diagnosis]) -> RobotState:
@@ -326,10 +329,11 @@ def _headline(state: State, posterior: Mapping[str, float]) -> str:
 def _motor_states(
     diagnoses: Sequence[Diagnosis], states: Sequence[State], found: RobotState, robot: Robot
 ) -> tuple[MotorState, ...]:
-    """Return the state of each motor; an unknown fault leaves every motor open."""
+    """Return the state of each motor; an unknown fault or an uncertain set-up leaves all open."""
     by_run = [{} if d.undecided else motor_probabilities(d.posterior) for d in diagnoses]
     over_all = motor_probabilities(found.posterior)
     unknown = found.posterior.get(str(UNKNOWN), 0.0) if found.posterior else 1.0
+    unknown = 1.0 if found.headline == SET_UP_HEADLINE else unknown
     rows = []
     for name, motor in zip(robot.motor_names, robot.motors, strict=True):
         chance = over_all.get(name, 0.0)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import FailureTwinError, InputError, unknown_name
+from failuretwin.core.hypothesis import Fault
 from failuretwin.failure_behavior.mode import FaultMode
 from failuretwin.failure_behavior.modes import BUILT_IN
 
@@ -63,6 +64,12 @@ class ModeRegistry(Mapping[str, FaultMode]):
 
 MODES = ModeRegistry()
 """The modes with their default distributions; `stuck` and `steady_state_error` are the paper's."""
+
+
+def plain_fault(fault: Fault) -> str:
+    """Return a fault as a person would say it, ``motor 3 stuck``; by its id if it is not known."""
+    motor, mode = fault.motor.replace("_", " "), MODES.get(fault.mode)
+    return f"{motor} {fault.mode.replace('_', ' ')}" if mode is None else mode.plain_name(motor)
 
 
 def register_mode(mode: FaultMode) -> None:

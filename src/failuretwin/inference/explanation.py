@@ -24,7 +24,7 @@ from failuretwin.core.hypothesis import (
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import Signature
-from failuretwin.failure_behavior.registry import MODES
+from failuretwin.failure_behavior.registry import MODES, plain_fault
 from failuretwin.inference.advice import (
     MOVEMENT,
     advice_lines,
@@ -103,12 +103,7 @@ def plain_name(hypothesis: Hypothesis) -> str:
     """
     if not hypothesis.known:
         return "something that none of the known faults explains"
-    return " and ".join(_plain_fault(fault) for fault in hypothesis.faults) or "healthy"
-
-
-def _plain_fault(fault: Fault) -> str:
-    motor, mode = fault.motor.replace("_", " "), MODES.get(fault.mode)
-    return f"{motor} {fault.mode.replace('_', ' ')}" if mode is None else mode.plain_name(motor)
+    return " and ".join(map(plain_fault, hypothesis.faults)) or "healthy"
 
 
 def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:

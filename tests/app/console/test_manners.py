@@ -65,7 +65,7 @@ def test_angles_are_in_the_unit_of_the_reader(person):
     person.go("/import")
     person.find("//input[@type='file']")
     person.go(f"/robot?name={LIVE}")
-    person.waits(lambda: "counts" in person.find("//tr[td[normalize-space()='motor_1']]").text)
+    person.waits(lambda: "counts" in person.find("//tr[td[normalize-space()='motor 1']]").text)
     person.browser.delete_cookie("unit")
 
 

@@ -35,13 +35,13 @@ def test_lives_are_in_the_store_with_their_days(lives):
     assert store.robots() == names
     assert said.startswith(f"2 robots, {WEEKS // 2} runs, ")
     faults = store.fleet_faults("armpi_fpv")
-    assert faults.hours == 2 * (WEEKS // 4 - 4) * 168.0  # from the end of the first four weeks
+    assert faults.hours == 2 * (WEEKS // 4 - 1) * 168.0
     for number, name in enumerate(names):
         life = years.life(number)
         ages = store.motor_ages(name)
         repaired = {one.motor: one.at for one in life.repairs if one.at < life.weeks[-1].at}
         for motor, age in ages.items():
-            since = repaired.get(motor, life.weeks[3].at)
+            since = repaired.get(motor, life.weeks[0].at)
             assert age == pytest.approx((life.weeks[-1].at - since).total_seconds() / 3600.0)
 
 

@@ -73,5 +73,5 @@ def test_alarms_are_those_of_one_process_whatever_is_killed(server, alone, tmp_p
         texts = [row.text for row in connection.execute(notes.select())]
     assert len(texts) == len(set(texts)) == len(expected)
     health = {name: kept.history(name).health for name in ("arm_1", "arm_2")}
-    assert "motor_3: stuck, raised" in str(health["arm_1"])
+    assert "motor 3 stuck, raised" in str(health["arm_1"])
     assert "no open fault" in str(health["arm_2"])

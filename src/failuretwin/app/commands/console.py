@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
+import shutil
+import socket
 import tempfile
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +18,7 @@ from failuretwin.app.commands import options as opt
 from failuretwin.app.commands.fleet import AccessOptions, access_options
 from failuretwin.app.commands.store import StoreOptions, store_options
 from failuretwin.app.terminal import tell
-from failuretwin.core.errors import InputError, needs_extra
+from failuretwin.core.errors import InputError, needs_extra, reason
 
 if TYPE_CHECKING:
     from failuretwin.app.console.live import LiveRobot
@@ -23,6 +26,8 @@ if TYPE_CHECKING:
     from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 
 ROLES = ("see", "confirm", "move")
+FOLDER, LOCK = "failuretwin-console-", "lock"
+"""Names of folders of consoles, and of the file in them that each holds while it works."""
 
 
 @click.command()
@@ -86,11 +91,11 @@ def console(
         raise InputError(f"{users}: names nobody. Add one: --add-user NAME.")
     if not (demo or source or url or memory.store):
         raise InputError("nothing to show. Name a SOURCE, --store or --fleet, or use --demo.")
+    _check_free(host, port)
     with needs_extra("the console needs NiceGUI", "console"):
         import nicegui  # noqa: F401
     with ExitStack() as stack:
-        made = tempfile.TemporaryDirectory(prefix="failuretwin-", ignore_cleanup_errors=True)
-        folder = Path(stack.enter_context(made))
+        folder = _own_folder(stack)
         stored, known = (None, robot.known) if memory.store is None else memory.look_up(robot)
         arms: dict[str, LiveRobot] = {}
         store = None if stored is None else stored.store
@@ -108,6 +113,32 @@ def console(
         expected = len(ARMS) + len(LOGS) + demo_robots + bool(demo_robots) if demo else 0
         desk = Desk(known, store, reached, arms, move, speed, folder, expected=expected)
         serve(desk, Listening(host, port, sessions))
+
+
+def _check_free(host: str, port: int) -> None:
+    """Raise InputError unless the server can listen there."""
+    try:
+        with socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
+        ):
+            return
+    except OSError as error:
+        raise InputError(
+            f"cannot listen on {host}, port {port} ({reason(error)}). Choose another --port, or "
+            "end the program that uses it."
+        ) from error
+
+
+def _own_folder(stack: ExitStack) -> Path:
+    """Return a folder that goes with this process; those of consoles that were killed go now."""
+    for old in Path(tempfile.gettempdir()).glob(f"{FOLDER}*"):
+        with suppress(OSError), (old / LOCK).open() as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held by a console that works
+            shutil.rmtree(old)
+    made = tempfile.TemporaryDirectory(prefix=FOLDER, ignore_cleanup_errors=True)
+    folder = Path(stack.enter_context(made))
+    fcntl.flock(stack.enter_context((folder / LOCK).open("w")), fcntl.LOCK_EX)
+    return folder
 
 
 def _begin_demo(

@@ -6,12 +6,11 @@ import re
 import tempfile
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from html import escape
 from pathlib import Path
 
-from nicegui import events, ui
+from nicegui import events, run, ui
 
 from failuretwin.app.console import draw, texts
 from failuretwin.app.console.checking import CheckRun, beat_watch
@@ -23,7 +22,7 @@ from failuretwin.app.reports.check_report import check_lines, closing_lines
 from failuretwin.app.terminal import Table
 from failuretwin.connection.links.base import Commander
 from failuretwin.connection.links.replay import Pace
-from failuretwin.core.errors import FailureTwinError
+from failuretwin.core.errors import FailureTwinError, InputError
 from failuretwin.core.foreign import printable
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.robot_state import robot_state
@@ -36,8 +35,9 @@ LINES_S = 0.5
 SHORTEST_CHECK_S, LONGEST_CHECK_S = 5.0, 120.0
 BEAT = "<script>setInterval(() => window.socket?.connected && emitEvent('beat'), 1000)</script>"
 """Signs of a page that it works: its arm is stopped if they stay away."""
-SUFFIXES = (".nc", ".csv", ".mat", ".bag", ".mcap", ".db3", ".parquet")
-"""Files that are taken."""
+SUFFIXES = (".nc", ".csv", ".mat", ".bag", ".mcap", ".db3")
+ENDINGS = ", ".join(SUFFIXES)
+"""Endings of the files that are taken."""
 LABELS = f"""for (const one of document.querySelectorAll(".q-uploader__input, .q-uploader a"))
 one.setAttribute("aria-label", "{texts.DROP_LABEL}")"""
 """Names the parts of the upload for screen readers."""
@@ -175,91 +175,131 @@ def _result(result: CheckResult, known: CalibratedRobot, visit: Visit) -> None:
 # Logs.
 
 
-@dataclass(frozen=True)
-class Arrived:
-    """A log that arrived, as it lies in our folder."""
+class ImportPage:
+    """Takes logs, and says below each what it shows, or why it is refused and how to mend that."""
 
-    path: Path
-    name: str
+    def __init__(self, visit: Visit) -> None:
+        from failuretwin.digital_model.robot import bundled_robots
+
+        desk = visit.desk
+        self._visit, self._stores = visit, visit.confirms and desk.store is not None
+        own = desk.known.robot.name
+        with ui.row().classes("gap-4 items-end"):
+            kinds = sorted({own, *bundled_robots()})
+            self._kind = draw.Choice(kinds, own, texts.PROFILE)
+            if self._stores:
+                self._robot = ui.input(texts.ROBOT_NAME).props("maxlength=64").classes("w-64")
+        limit = texts.TOO_LARGE.format(limit=LARGEST_UPLOAD // 1024**2)
+        upload = ui.upload(
+            label=texts.DROP.format(endings=ENDINGS),
+            on_upload=self._take,
+            auto_upload=True,
+            max_file_size=LARGEST_UPLOAD,
+            on_rejected=lambda: self._refuse(texts.REJECTED.format(limit=limit)),
+        )
+        upload.on("uploaded", upload.reset)  # its list has a tick for files that are refused too
+        upload.classes("w-full")
+        self._status = ui.element("div").props('role="status"')
+        ui.timer(0.2, lambda: ui.run_javascript(LABELS), once=True)
+
+    async def _take(self, event: events.UploadEventArguments) -> None:
+        data = await event.file.read()
+        try:
+            log = placed(self._visit.desk.folder, event.file.name, data)
+        except InputError as error:
+            self._refuse(str(error))
+        else:
+            await self._read(log)
+
+    async def _read(self, log: Path, columns: str = "") -> None:
+        """Diagnose a log, by a map of its columns (TOML) if there is one."""
+        desk, kind = self._visit.desk, self._kind.value
+        self._status.clear()
+        with self._status:
+            draw.text(texts.READING.format(name=log.name))
+        name = str(self._robot.value or "").strip() if self._stores else ""
+        try:
+            found = await run.io_bound(desk.diagnose, log, kind, name, columns)
+        except FailureTwinError as error:
+            self._refuse(str(error).replace(f"{log.parent}/", ""), log, columns)
+            return
+        self._status.clear()
+        if found is not None:
+            with self._status:
+                await self._show(log.name, found, kind)
+
+    def _refuse(self, why: str, log: Path | None = None, columns: str = "") -> None:
+        """Say why a log is refused; where a map of its columns would help, ask for it."""
+        asks = bool(columns) or "--columns" in why
+        for option, place in texts.FIELDS.items():
+            why = why.replace(option, place)
+        self._status.clear()
+        with self._status:
+            draw.alert(texts.REFUSED.format(why=why))
+            if log is None or not asks:
+                return
+            known = self._visit.desk.of_kind(self._kind.value)
+            guess = columns or guessed_columns(log, known)
+            field = ui.textarea(texts.COLUMNS, value=guess).props("outlined autogrow")
+            field.classes("w-full font-mono")
+            draw.button(texts.READ_AGAIN, lambda: self._read(log, str(field.value)))
+
+    async def _show(self, log: str, found: Imported, kind: str) -> None:
+        visit, known = self._visit, self._visit.desk.of_kind(kind)
+        if known is None:
+            return
+        state = robot_state(found.diagnoses, known.robot)
+        words = partial(visit.words, robot=known.robot)
+        draw.heading(words(f"{log}: {state.headline}"))
+        draw.text(words(state.step))
+        rows = [[one.run, words(one.verdict)] for one in found.diagnoses]
+        draw.table((texts.RUN, texts.VERDICT), rows)
+        for line in found.stored or [self._why_not_stored()]:
+            draw.text(line)
+        number = await draw.worked(_report, visit.desk, found, known)
+        if number is not None:
+            ui.link(texts.REPORT, f"/report/{number}", new_tab=True)
+
+    def _why_not_stored(self) -> str:
+        """Return why a log is not stored, and how to change that."""
+        if not self._visit.confirms:
+            return texts.NOT_BY_YOU.format(role=self._visit.session.role)
+        return texts.NO_NAME if self._stores else texts.NOWHERE_TO_STORE
 
 
 def show_import(visit: Visit) -> None:
     """Draw the page for logs."""
-    from failuretwin.digital_model.robot import bundled_robots
-
-    desk = visit.desk
-    own = desk.known.robot.name
     with page(visit, texts.IMPORT):
-        with ui.row().classes("gap-4 items-end"):
-            kinds = sorted({own, *bundled_robots()})
-            kind = draw.Choice(kinds, own, texts.PROFILE)
-            robot = ui.input(texts.ROBOT_NAME).props("maxlength=64").classes("w-64")
-        status = ui.element("div").props('role="status"')
-
-        async def take(event: events.UploadEventArguments) -> None:
-            status.clear()
-            with status:
-                draw.text(texts.WORKING)
-            data = await event.file.read()
-            arrived = _placed(desk.folder, event.file.name, data)
-            wanted = str(robot.value or "").strip() if visit.confirms else ""
-            found = None
-            if isinstance(arrived, str):
-                ui.notify(arrived, type="negative", multi_line=True)
-            else:
-                found = await draw.worked(desk.diagnose, arrived.path, kind.value, wanted)
-            status.clear()
-            if found is not None:
-                with status:
-                    await _show_imported(visit, found, kind.value)
-
-        upload = ui.upload(
-            label=texts.DROP,
-            on_upload=take,
-            auto_upload=True,
-            max_file_size=LARGEST_UPLOAD,
-            max_files=20,
-            on_rejected=lambda: ui.notify(
-                texts.REFUSED.format(why=texts.TOO_LARGE.format(limit=LARGEST_UPLOAD // 1024**2)),
-                type="negative",
-            ),
-        )
-        upload.classes("w-full")
-        ui.timer(0.2, lambda: ui.run_javascript(LABELS), once=True)
+        ImportPage(visit)
 
 
-def _placed(folder: Path, name: str, data: bytes) -> Arrived | str:
-    """Write a log under a name of our own, or return why it is refused."""
+def placed(folder: Path, name: str, data: bytes) -> Path:
+    """Write a log under a name of our own, and return where it is.
+
+    Raises:
+        InputError: If it is of no kind that can be read.
+    """
     stem, suffix = Path(name.replace("\\", "/")).stem, Path(name).suffix.lower()
     if suffix not in SUFFIXES:
-        why = f"{printable(name)[:80]}: expected one of {', '.join(SUFFIXES)}"
-        return texts.REFUSED.format(why=why)
+        raise InputError(texts.OTHER_ENDING.format(name=printable(name)[:80], endings=ENDINGS))
     if len(data) > LARGEST_UPLOAD:
-        return texts.REFUSED.format(why=texts.TOO_LARGE.format(limit=LARGEST_UPLOAD // 1024**2))
+        raise InputError(texts.TOO_LARGE.format(limit=LARGEST_UPLOAD // 1024**2))
     safe = re.sub(r"[^A-Za-z0-9_-]", "_", stem)[:64] or "log"
-    place = Path(tempfile.mkdtemp(dir=folder))
-    path = place / f"{safe}{suffix}"
+    path = Path(tempfile.mkdtemp(dir=folder)) / f"{safe}{suffix}"
     path.write_bytes(data)
-    return Arrived(path, safe)
+    return path
 
 
-async def _show_imported(visit: Visit, found: Imported, kind: str) -> None:
-    known = visit.desk.of_kind(kind)
-    if known is None:
-        return
-    state, words = (
-        robot_state(found.diagnoses, known.robot),
-        partial(visit.words, robot=known.robot),
-    )
-    draw.heading(words(state.headline))
-    draw.text(words(state.step))
-    rows = [[one.run, words(one.verdict)] for one in found.diagnoses]
-    draw.table((texts.RUN, texts.VERDICT), rows)
-    for line in found.stored or [texts.NOT_STORED]:
-        draw.text(line)
-    number = await draw.worked(_report, visit.desk, found, known)
-    if number is not None:
-        ui.link(texts.REPORT, f"/report/{number}", new_tab=True)
+def guessed_columns(log: Path, known: CalibratedRobot | None) -> str:
+    """Return a guess of the columns of a table (TOML), to be checked; empty: there is none."""
+    from failuretwin.data_knowledge.readers.column_guess import column_map_text
+
+    if log.suffix != ".csv" or known is None:
+        return ""
+    try:
+        return column_map_text(log, known.robot)
+    except InputError:
+        return ""
 
 
 def _report(desk: Desk, found: Imported, known: CalibratedRobot) -> int:

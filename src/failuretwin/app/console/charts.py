@@ -9,10 +9,12 @@ from nicegui import ui
 
 from failuretwin.app.console import draw, texts
 from failuretwin.app.console import state as shown
-from failuretwin.app.console.state import Trace
+from failuretwin.app.console.state import Clock, Trace
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
+from failuretwin.inference.explanation import plain_name
 
 MOST_POINTS = 600
 """Points of a chart."""
@@ -39,7 +41,11 @@ def posterior_lines(trace: Trace, since_s: float) -> list[Line]:
     names = [name for name in sorted(most, key=lambda n: -most[n]) if most[name] >= INTERESTING]
     time = np.array([at for at, _ in kept])
     return [
-        (name, time, np.array([posterior.get(name, np.nan) for _, posterior in kept]))
+        (
+            plain_name(Hypothesis.parse(name)),
+            time,
+            np.array([posterior.get(name, np.nan) for _, posterior in kept]),
+        )
         for name in names[:MOST_LINES]
     ]
 
@@ -49,7 +55,7 @@ def residual_lines(trace: Trace, arm: InverseKinematics, since_s: float) -> list
     rows = np.flatnonzero((trace.time >= since_s) & np.isfinite(trace.measured).all(axis=1))
     rows = rows[:: max(1, len(rows) // RESIDUAL_POINTS)]
     value = 1e3 * shown.residuals(arm, trace.command[rows], trace.measured[rows])
-    names = [*arm.robot.motor_names, texts.TOTAL]
+    names = [*map(draw.spoken, arm.robot.motor_names), texts.TOTAL]
     return [(name, trace.time[rows], one) for name, one in zip(names, value.T, strict=True)]
 
 
@@ -78,20 +84,25 @@ class Chart:
         if note:
             draw.text(note).classes("soft")
         self._title, self._axis = title, axis
+        self._clock: Clock | None = None
         self._chart: ui.echart | None = None
         self._place = ui.element("div").classes("chart")
         draw.later(self._load)
 
     def _load(self) -> None:
         grid = {"lineStyle": {"color": GRID}}
-        label = {"axisLabel": {"color": LABEL}, "splitLine": grid, "axisLine": grid}
+        label = {
+            "axisLabel": {"color": LABEL, "hideOverlap": True},
+            "splitLine": grid,
+            "axisLine": grid,
+        }
         axis: dict[str, Any] = {"type": "value", "scale": True, **label}
         options = {
             "animation": False,
             "color": COLOURS,
             "legend": {"top": 0, "itemWidth": 14, "itemGap": 8, "textStyle": {"color": LABEL}},
-            "grid": {"left": 45, "right": 15, "top": 50, "bottom": 25},
-            "xAxis": {**axis, "min": "dataMin", "max": "dataMax"},
+            "grid": {"left": 45, "right": 25, "top": 50, "bottom": 25},
+            "xAxis": {**axis, "name": "s"},
             "yAxis": {**axis, **self._axis},
             "series": [],
         }
@@ -99,15 +110,26 @@ class Chart:
             chart = ui.echart(options).classes("full")
         self._chart = chart.props(f'role="img" aria-label="{self._title}"')
 
-    def show(self, lines: list[Line]) -> None:
-        """Draw lines."""
+    def show(self, lines: list[Line], clock: Clock | None) -> None:
+        """Draw lines, over the time of day where it is known."""
+        self._clock = clock
         if self._chart is not None:
-            self._chart.options["series"] = _series(lines)
+            if clock is not None:
+                self._chart.options["xAxis"] |= {"type": "time", "name": ""}
+            self._chart.options["series"] = _series([
+                (name, self._across(time), value) for name, time, value in lines
+            ])  # fmt: skip
+
+    def _across(self, time: FloatArray) -> FloatArray:
+        """Return times [s] as they are drawn: seconds, or milliseconds since 1970."""
+        clock = self._clock
+        return time if clock is None else 1e3 * (clock.start + clock.pace * time)
 
     def mark(self, at: float) -> None:
         """Mark a time [s] with a line."""
+        across = round(float(self._across(np.array(at))), 2)
         line = {"silent": True, "symbol": "none", "label": {"show": False}, "animation": False}
-        told = {"series": [{"markLine": {**line, "data": [{"xAxis": round(at, 2)}]}}]}
+        told = {"series": [{"markLine": {**line, "data": [{"xAxis": across}]}}]}
         if self._chart is not None:
             self._chart.run_chart_method("setOption", told)
 
@@ -145,10 +167,10 @@ class Charts:
 
     def show(self, trace: Trace, since_s: float) -> None:
         """Draw a trace from a time on."""
-        self._residuals.show(residual_lines(trace, self._arm, since_s))
-        self._tool.show(tool_lines(trace, self._known, since_s))
+        self._residuals.show(residual_lines(trace, self._arm, since_s), trace.clock)
+        self._tool.show(tool_lines(trace, self._known, since_s), trace.clock)
         if self._posterior is not None:
-            self._posterior.show(posterior_lines(trace, since_s))
+            self._posterior.show(posterior_lines(trace, since_s), trace.clock)
 
     def mark(self, at: float) -> None:
         """Mark a time [s]."""

@@ -29,6 +29,14 @@ from failuretwin.inference.diagnoser import BayesDiagnoser
 
 DAY_S = 86_400
 LOW_PRIORITY = 10
+CHILD = """import os, threading
+def end_with_parent():
+    os.read(0, 1)
+    os._exit(1)
+threading.Thread(target=end_with_parent, daemon=True).start()
+from failuretwin.app.cli import main
+main()"""
+"""Runs a command. Its input ends when its parent does, however that ends; then it ends too."""
 YEAR_SEED = 5
 ARMS = {
     "hall_1-arm_1": ((), 0.0),
@@ -129,8 +137,9 @@ class HistoryWriter:
         """Run a command to its end, unless all is stopped."""
         if self._stopped:
             return
-        command, quiet = [sys.executable, "-m", "failuretwin", *arguments], subprocess.DEVNULL
-        self._process = subprocess.Popen(command, stdout=quiet, stderr=quiet)
+        command, quiet = [sys.executable, "-c", CHILD, *arguments], subprocess.DEVNULL
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(command, stdin=pipe, stdout=quiet, stderr=quiet)
         os.setpriority(os.PRIO_PROCESS, self._process.pid, LOW_PRIORITY)
         self._process.wait()
 

@@ -17,6 +17,7 @@ import numpy as np
 from failuretwin.app.console import state as shown
 from failuretwin.app.console import texts
 from failuretwin.app.console.checking import CheckRun
+from failuretwin.app.console.draw import spoken
 from failuretwin.app.console.live import LiveRobot
 from failuretwin.app.console.state import Tile, Trace
 from failuretwin.app.remembering import RobotRecord
@@ -25,7 +26,8 @@ from failuretwin.core.errors import FailureTwinError, InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.movements import find_movements
 from failuretwin.core.types import as_floats
-from failuretwin.data_knowledge.readers.read import read_runs
+from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
+from failuretwin.data_knowledge.records.history import FaultEpisode
 from failuretwin.data_knowledge.records.log_files import log_file
 from failuretwin.data_knowledge.records.overview import RobotGlance, StoredRun
 from failuretwin.data_knowledge.records.store import Store
@@ -118,7 +120,10 @@ class Desk:
         kinds = {name: tile.kind for name, tile in found.items()}
         for tile in self._fleet:
             found[tile.name] = replace(tile, kind=kinds.get(tile.name, tile.kind))
-        found |= {name: robot.tile for name, robot in self.live.items()}
+        faults = {one.robot: one.faults for one in self._glances}
+        found |= {
+            name: robot.tile.alarmed(faults.get(name, {})) for name, robot in self.live.items()
+        }
         return shown.worst_first(list(found.values()))
 
     @property
@@ -194,19 +199,32 @@ class Desk:
         record = RobotRecord(self.store, name, known.robot)
         return replace(record, calibration=self.store.calibration(name))
 
-    def diagnose(self, path: Path, kind: str, name: str) -> Imported:
-        """Diagnose a log, and store the diagnoses as those of a robot; no name: store nothing.
+    def diagnose(self, path: Path, kind: str, name: str, columns: str = "") -> Imported:
+        """Diagnose a log, and store the diagnoses as those of a robot.
+
+        Args:
+            path: The log, in a folder of its own.
+            kind: Name of its profile.
+            name: Name of the robot; empty: nothing is stored.
+            columns: Map of its columns or topics (TOML); empty: their names tell.
 
         Raises:
             InputError: If it cannot be read.
             OutputError: If it cannot be stored.
         """
+        from failuretwin.app.inputs import with_map
+
         known = self.of_kind(kind, name)
         if known is None:
             raise InputError(
                 f"unknown profile {kind!r}. Expected a bundled robot or that of --robot."
             )
-        runs = read_runs(path, known.robot)
+        written = path.with_name("columns.toml") if columns else None
+        if written is not None:
+            written.write_text(columns, "utf-8")
+        options, correction = with_map(ReadOptions(), written, [path], known.robot)
+        runs = read_runs(path, known.robot, options)
+        runs = runs if correction is None else correction.runs(runs)
         diagnoses = BayesDiagnoser(known.twin, known.imperfections).diagnose(runs)
         record = self.record(name, known)
         lines: list[str] = []
@@ -237,6 +255,11 @@ class Desk:
         """Return the faults of the open episodes of a robot in the store, ``MOTOR:MODE``."""
         glance = self._glance(name)
         return [] if glance is None else list(glance.faults)
+
+    def open_episodes(self, name: str) -> list[FaultEpisode]:
+        """Return the open episodes of a robot in the store."""
+        store = self.store if self._glance(name) is not None else None
+        return [] if store is None else store.history(name).open_episodes
 
     def _glance(self, name: str) -> RobotGlance | None:
         return next((one for one in self._glances if one.robot == name), None)
@@ -294,7 +317,9 @@ class Desk:
         model = HealthyModel(known.twin, known.imperfections)
         lives = motor_lives(rows, model, np.random.default_rng(0))
         few = texts.TOO_FEW.format(least=LEAST_RUNS)
-        return [f"{motor}: {life.verdict if life else few}" for motor, life in lives.items()]
+        return [
+            f"{spoken(motor)}: {life.verdict if life else few}" for motor, life in lives.items()
+        ]
 
 
 def has_log(run: StoredRun) -> bool:

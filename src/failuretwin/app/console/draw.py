@@ -35,6 +35,11 @@ class _Text(ui.label):
         self.tag = tag
 
 
+def spoken(motor: str) -> str:
+    """Return the name of a motor as verdicts say it."""
+    return motor.replace("_", " ")
+
+
 def heading(words: str, level: int = 2) -> ui.label:
     """Draw a heading."""
     return text(words, f"h{level}")
@@ -61,6 +66,7 @@ class Choice:
         value: str,
         label: str,
         on_change: Callable[[], object] = lambda: None,
+        words: Callable[[str], str] = str,
     ) -> None:
         self.value = value
         self._options, self._on_change = options, on_change
@@ -70,7 +76,7 @@ class Choice:
             chosen.on("change", self._choose, js_handler="(e) => emit(e.target.selectedIndex)")
             with chosen:
                 for one in options:
-                    option = text(one, "option")
+                    option = text(words(one), "option")
                     if one == value:
                         option.props("selected")
 
@@ -132,11 +138,11 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
             with ui.element("tbody"):
                 for row in rows:
                     with ui.element("tr"):
-                        for cell in row:
-                            if isinstance(cell, str):
-                                text(cell, "td")
-                            else:
-                                with ui.element("td"):
+                        for head, cell in zip(headings, row, strict=False):
+                            place = text(cell if isinstance(cell, str) else "", "td")
+                            place.props["data-label"] = head  # beside it on narrow pages
+                            if not isinstance(cell, str):
+                                with place:
                                     cell()
 
 

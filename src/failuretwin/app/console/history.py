@@ -12,7 +12,7 @@ from failuretwin.app.console.layout import Visit, page
 from failuretwin.app.console.users import CONFIRM
 from failuretwin.connection.fault_rates import LearnedRates
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.data_knowledge.records.episodes import CONFIRMED
 from failuretwin.data_knowledge.records.history import (
     OTHER_CAUSE,
@@ -22,7 +22,10 @@ from failuretwin.data_knowledge.records.history import (
 )
 from failuretwin.data_knowledge.records.offsets import Drift
 from failuretwin.data_knowledge.records.store import Store
+from failuretwin.inference.explanation import plain_name
 
+DIRECTED = ("zero", "bias")
+"""Offsets that turn a motor one way or the other; others are sizes."""
 LONGEST = 200
 """Length of a name, note, cause or part [letters]."""
 
@@ -113,7 +116,7 @@ class HistoryPage:
             until = f" - {time(one.until)}" if one.until else ""
             rows.append([
                 str(one.number),
-                f"{one.motor}: {one.mode}",
+                one.fault,
                 one.state,
                 f"{time(one.since)}{until}",
                 said,
@@ -146,9 +149,8 @@ class HistoryPage:
         draw.heading(texts.NOTE_REPAIR)
         names = known.robot.motor_names
         with ui.row().classes("gap-4 items-end"):
-            motor = draw.Choice(
-                names, self._repaired or suspected_motor(history, names), texts.MOTOR
-            )
+            first = self._repaired or suspected_motor(history, names)
+            motor = draw.Choice(names, first, texts.MOTOR, words=draw.spoken)
             part = _field(texts.PART)
 
             def work() -> None:
@@ -174,7 +176,15 @@ class HistoryPage:
         seen, ages = self._store.fleet_faults(kind), self._store.motor_ages(self._name)
         learned = LearnedRates.of(seen, paper_hypotheses(known.robot.motor_names), ages)
         draw.text(learned.line)
-        rows = [[one.name, str(one.confirmed), f"{one.factor:.2f}"] for one in learned.rates]
+        draw.text(texts.RATE_NOTE).classes("soft")
+        rows = [
+            [
+                *(plain_name(Hypothesis.parse(one.name)), one.ages, str(one.confirmed)),
+                *(f"{one.hours / 24.0:.0f}", f"{1000.0 * one.mean_per_h:.2g}"),
+                f"{one.factor:.2g}",
+            ]
+            for one in learned.rates
+        ]
         draw.table(texts.RATE_COLUMNS, rows)
 
 
@@ -228,7 +238,7 @@ def _compare(visit: Visit, history: History) -> None:
         place.clear()
         dates = [then.value, now.value]
         rows = [
-            [one.motor, one.name, *_at_dates(visit, one, dates, one.motor)]
+            [draw.spoken(one.motor), one.name, *_at_dates(visit, one, dates, one.motor)]
             for one in history.drifts
             if one.motor in known.robot.motor_names
         ]
@@ -251,14 +261,12 @@ def _at_dates(visit: Visit, drift: Drift, dates: list[str], motor: str) -> list[
         values.append(before[-1] if before else 0)
     angle = drift.unit.startswith("rad") and motor in known.motor_names
 
-    def word(value: float) -> str:
+    def word(value: float, directed: bool = drift.name in DIRECTED) -> str:
         if angle:
-            told = visit.angle(value, known, known.motor_names.index(motor), relative=True)
+            told = visit.difference(value, known, known.motor_names.index(motor), directed)
             return told + drift.unit.removeprefix("rad")
         return f"{value:.4g} {drift.unit}"
 
-    told = [
-        f"{word(drift.values[k])} ± {word(drift.deviations[k]).removeprefix('-')}" for k in values
-    ]
+    told = [f"{word(drift.values[k])} ± {word(drift.deviations[k], False)}" for k in values]
     change = drift.values[values[1]] - drift.values[values[0]]
     return [*told, word(change)]

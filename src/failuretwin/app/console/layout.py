@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING
 from zoneinfo import ZoneInfo
@@ -17,6 +17,7 @@ from nicegui import ui
 from failuretwin.app.console import draw, texts
 from failuretwin.app.console.desk import Desk
 from failuretwin.app.console.guard import ALIVE
+from failuretwin.app.console.state import STAMP
 from failuretwin.app.console.users import CONFIRM, Session
 from failuretwin.digital_model.robot import Robot
 
@@ -32,6 +33,8 @@ DEGREES = re.compile(
     rf"(?P<place>stuck at )?(?P<values>{NUMBER.pattern}(?: (?:to )?{NUMBER.pattern})*) deg\b"
 )
 """Angles in a text: where a motor stands, or differences or speeds, with deviations or ranges."""
+STAMPS = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
+"""Times (UTC) in a text."""
 CHOICES = {"theme": texts.THEMES, "unit": texts.UNIT_NAMES}
 YEAR_S = 31_536_000
 COLOURS = {
@@ -55,6 +58,12 @@ p { margin: .25rem 0; overflow-wrap: anywhere; }
 table.plain { border-collapse: collapse; width: 100%; }
 table.plain th, table.plain td { text-align: left; padding: .25rem .6rem; vertical-align: top;
   border-bottom: 1px solid var(--line); overflow-wrap: break-word; }
+table.plain td:first-child { white-space: nowrap; }
+@media (max-width: 599px) { table.plain thead { display: none; }
+  table.plain tr { display: block; border-bottom: 1px solid var(--line); padding: .3rem 0; }
+  table.plain td { display: flex; gap: .6rem; border: 0; padding: .1rem 0; }
+  table.plain td:empty { display: none; } table.plain .q-btn { margin: .2rem .3rem .2rem 0; }
+  table.plain td::before { content: attr(data-label); flex: 0 0 7rem; opacity: .85; } }
 .state { color: #fff; border-radius: .3rem; padding: 0 .5rem; display: inline-block; }
 .choice { font-size: 1rem; border: 1px solid #6b757e; border-radius: .3rem; padding: .3rem .4rem;
   background: #fff; color: #16191c; }
@@ -164,12 +173,22 @@ class Visit:
             return ""
         return f"{at.astimezone(self.zone):%Y-%m-%d %H:%M{':%S' if seconds else ''}}"
 
-    def angle(self, value: float, robot: Robot, motor: int, relative: bool = False) -> str:
+    def angle(self, value: float, robot: Robot, motor: int) -> str:
         """Return an angle of a motor [rad], or a place of one that slides [m], in words."""
         if robot.slides[motor]:
             return f"{1e3 * value:.1f} mm"
-        told, unit = self._shown(value, robot, relative)
-        return f"{told:.{DIGITS[unit] + relative}f} {unit}"
+        told, unit = self._shown(value, robot)
+        return f"{told:.{DIGITS[unit]}f} {unit}"
+
+    def difference(self, value: float, robot: Robot, motor: int, directed: bool) -> str:
+        """Return a difference of angles of a motor [rad], or of places [m], in words.
+
+        One that is not directed, such as friction or a deviation, has the sign of the number.
+        """
+        if robot.slides[motor]:
+            return f"{1e3 * value:.2f} mm"
+        told, unit = self._shown(value, robot, relative=True)
+        return f"{told if directed else np.copysign(told, value):z.{DIGITS[unit] + 1}f} {unit}"
 
     def held(self, told: float, robot: Robot, motor: int) -> float:
         """Return the angle [rad] or place [m] that a number in the unit of the reader means."""
@@ -183,10 +202,11 @@ class Visit:
         return self._shown(0.0, robot)[1]
 
     def words(self, text: str, robot: Robot | None) -> str:
-        """Return a text whose angles, in degrees, are put into the unit of the reader.
+        """Return a text with times in the zone of the reader, and angles [deg] in the unit.
 
-        Those of a robot whose profile is not known stay in degrees.
+        Angles of a robot whose profile is not known stay in degrees.
         """
+        text = STAMPS.sub(lambda found: self._clock(found[0]), text)
         if robot is None or self.unit == "deg":
             return text
 
@@ -194,7 +214,8 @@ class Visit:
 
         def number(relative: bool, found: re.Match[str]) -> str:
             value, _ = self._shown(float(np.deg2rad(float(found[2]))), robot, relative)
-            value = abs(value) if found[1] else value
+            size = relative and found[2][0] not in "+-"
+            value = abs(value) if found[1] or size else value
             return f"{found[1] or ''}{value:.{DIGITS[unit]}f}"
 
         def told(found: re.Match[str]) -> str:
@@ -202,6 +223,12 @@ class Visit:
             return f"{place}{NUMBER.sub(partial(number, not place), found['values'])} {unit}"
 
         return DEGREES.sub(told, text)
+
+    def _clock(self, stamp: str) -> str:
+        """Return a time in the zone of the reader; of today only the time of day."""
+        at = datetime.strptime(stamp, STAMP).replace(tzinfo=UTC)
+        today = self.day(at) == self.day(datetime.now(UTC))
+        return self.time(at, seconds=True).split()[-1] if today else self.time(at, seconds=True)
 
     def _shown(self, value: float, robot: Robot, relative: bool = False) -> tuple[float, str]:
         """Return an angle [rad] in the unit of the reader, and its name."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -15,7 +16,7 @@ import numpy as np
 
 from failuretwin.app.console import state as shown
 from failuretwin.app.console import texts
-from failuretwin.app.console.state import LiveView, Sample, Tile, Trace
+from failuretwin.app.console.state import Clock, LiveView, Sample, Tile, Trace
 from failuretwin.app.live import troubles_of
 from failuretwin.app.shadow import Changes, Shadow
 from failuretwin.app.watch_keeper import WatchKeeper
@@ -36,6 +37,8 @@ KEPT = 6000
 POSTERIOR_S = 1.0
 """Time between two kept posteriors [s]."""
 SHOWN_CHANGES = 8
+SINCE = re.compile(r"since (\d+\.\d) s(?: \((\d+\.\d) to (\d+\.\d) s\))?")
+"""When a fault began, in a verdict: by the time of the stream [s]."""
 POLL_S = 0.1
 HANGS_S = 60.0
 """Time without a step from which a watch counts as hanging [s]; a new alarm takes up to 20."""
@@ -94,6 +97,7 @@ class LiveRobot(Sink):
             maxlen=round(KEPT_S / POSTERIOR_S)
         )
         self._starts: deque[float] = deque(maxlen=MOVEMENTS)
+        self._lines: deque[str] = deque(maxlen=SHOWN_CHANGES)
         self._begun = 0
         self._seen_s = np.inf
         self._heard: datetime | None = None
@@ -147,7 +151,31 @@ class LiveRobot(Sink):
             self.view.diagnosis,
             posterior,
             self._begun - len(self._starts) + 1,
+            self.clock,
         )
+
+    @property
+    def clock(self) -> Clock | None:
+        """Time of day of the stream of an arm that works now; None: it is a log."""
+        own, seen = self.settings, self._samples
+        if not seen or (own.faults is None and not own.place):
+            return None
+        first, last = seen[0], seen[-1]
+        pace = (last.read - first.read) / (last.time - first.time) if last is not first else 1.0
+        return Clock(first.read - pace * first.time, pace)
+
+    def at(self, stream_s: float) -> str:
+        """Return a time of the stream in words."""
+        return shown.moment(self.clock, stream_s)
+
+    def dated(self, text: str) -> str:
+        """Return a verdict with times of day."""
+
+        def told(found: re.Match[str]) -> str:
+            since, *ends = (None if s is None else self.at(float(s)) for s in found.groups())
+            return f"since {since}" + (f" ({' to '.join(map(str, ends))})" if ends[0] else "")
+
+        return SINCE.sub(told, text)
 
     def put(self, item: Item) -> None:
         """Take what passes the shadow; its answers are read from the shadow itself."""
@@ -174,12 +202,22 @@ class LiveRobot(Sink):
                 troubles += (keeper.trouble,)
             counts, jumps = shadow.counts, shadow.clock.jumps
             changes = self._changes.notice(shadow.snapshot, counts, jumps, troubles)
+            changes = [replace(one, text=self.dated(one.text)) for one in changes]
+            self._lines += [f"{self.at(one.stream_time)} {one.text}" for one in changes]
             if keeper is not None:
-                keeper.keep(changes, shadow.snapshot.answer)
+                keeper.keep(changes, self._dated_answer(shadow.snapshot.answer))
             self._remember(shadow)
         if keeper is not None:
-            keeper.end(shadow.snapshot, decided=own.monitor.fit.seen > PROOF)
+            last = replace(shadow.snapshot, answer=self._dated_answer(shadow.snapshot.answer))
+            keeper.end(last, decided=own.monitor.fit.seen > PROOF)
         self._end("")
+
+    def _dated_answer(self, answer: Answer) -> Answer:
+        """Return an answer as it is stored: with times of day."""
+        found = answer.diagnosis
+        if found is None:
+            return answer
+        return replace(answer, diagnosis=replace(found, verdict=self.dated(found.verdict)))
 
     def _remember(self, shadow: Shadow) -> None:
         """Take over the state of the shadow."""
@@ -198,7 +236,6 @@ class LiveRobot(Sink):
             self._posterior.append((at, diagnosis.posterior))
         self._seen_s = time.monotonic()
         now = tuple(statuses(answer, self.settings.known.robot.motor_names))
-        changes = tuple(list(self._changes.lines)[-SHOWN_CHANGES:])
         self.view = LiveView(
             self._tile(shadow, now[0].state, now[0].message),
             at,
@@ -206,7 +243,7 @@ class LiveRobot(Sink):
             now,
             diagnosis,
             answer.alarm,
-            changes,
+            tuple(self._lines),
         )
 
     def _reference(self, shadow: Shadow, at: float) -> np.ndarray | None:
@@ -221,6 +258,7 @@ class LiveRobot(Sink):
 
     def _tile(self, shadow: Shadow, word: str, message: str) -> Tile:
         own, alarm = self.settings, shadow.snapshot.answer.alarm
+        message = self.dated(message)
         state, said = STATES[word], message
         if message.startswith(BEFORE):
             said = texts.LAST_WORD.format(said=message.removeprefix(BEFORE))

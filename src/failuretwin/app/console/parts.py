@@ -17,6 +17,7 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.robot_state import SET_UP_STEP, robot_state
 from failuretwin.digital_model.robot import Robot
+from failuretwin.failure_behavior.registry import plain_fault
 from failuretwin.inference.advice import NOTHING_TO_DO, STEP
 from failuretwin.inference.explanation import joint_names_in, percent, plain_name
 
@@ -86,13 +87,13 @@ def motor_table(robot: Robot, diagnosis: Diagnosis, alarms: Sequence[str] | None
     """Draw the probability of a fault of each motor, and its open episodes if they are given."""
     draw.heading(texts.MOTORS)
     shares = shown.motor_shares(robot.motor_names, diagnosis)
-    rows = [[motor, percent(share)] for motor, share in shares.items()]
+    rows = [[draw.spoken(motor), percent(share)] for motor, share in shares.items()]
     heads: tuple[str, ...] = (texts.MOTOR, texts.PROBABILITY)
     if alarms is not None:
         heads = (*heads, texts.OPEN_EPISODES)
         faults = [fault for one in alarms for fault in Hypothesis.parse(one).faults]
-        for row in rows:
-            row.append(", ".join(fault.mode for fault in faults if fault.motor == row[0]))
+        for row, motor in zip(rows, shares, strict=True):
+            row.append(", ".join(plain_fault(fault) for fault in faults if fault.motor == motor))
     draw.table(heads, rows)
 
 
@@ -143,7 +144,9 @@ class Angles:
         def cell() -> None:
             self._cells.append(draw.text("", "span"))
 
-        rows: list[list[draw.Cell]] = [[name, cell, cell] for name in robot.motor_names]
+        rows: list[list[draw.Cell]] = [
+            [draw.spoken(name), cell, cell] for name in robot.motor_names
+        ]
         draw.table((texts.ANGLES, texts.TOLD, texts.DRAWN), rows)
 
     def show(self, command: FloatArray, pose: FloatArray) -> None:

@@ -44,7 +44,7 @@ class Replay:
     """A trace with a slider of its time."""
 
     def __init__(self, visit: Visit, trace: Trace, known: CalibratedRobot, at: float) -> None:
-        self._trace, self._robot = trace, known.robot
+        self._visit, self._trace, self._robot = visit, trace, known.robot
         self._arm = InverseKinematics.of(known.robot)
         diagnosis = trace.diagnosis
         low, high = float(trace.time[0]), float(trace.time[-1])
@@ -107,7 +107,8 @@ class Replay:
         pose = shown.seen_pose(self._arm, trace.command[k], trace.measured[near], suspects)
         self._scene.show(pose, trace.command[k], shown.motor_shares(motors, diagnosis))
         self._angles.show(trace.command[k], pose)
-        self._clock.set_text(texts.STREAM_TIME.format(time=at))
+        told = self._visit.words(shown.moment(trace.clock, at), None)
+        self._clock.set_text(told)
         if abs(at - self._marked) >= CHARTS_S or not self._timer.active:
             self._mark()
 

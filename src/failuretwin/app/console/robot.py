@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from datetime import UTC, datetime
 
 import numpy as np
@@ -14,8 +15,9 @@ from failuretwin.app.console.arm import ArmScene
 from failuretwin.app.console.charts import Charts
 from failuretwin.app.console.desk import has_log
 from failuretwin.app.console.layout import Visit, page
-from failuretwin.app.console.live import LiveRobot
+from failuretwin.app.console.live import STATES, LiveRobot
 from failuretwin.app.console.state import LiveView, Tile
+from failuretwin.connection.links.base import OK
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import printable
 from failuretwin.core.hypothesis import Diagnosis
@@ -93,7 +95,7 @@ def _runs(visit: Visit, name: str, robot: Robot | None) -> None:
 
     def link(words: str, page_name: str, one: StoredRun) -> draw.Cell:
         if not has_log(one):
-            return texts.NO_LOG
+            return ""
         address = draw.link_to(page_name, name=name, run=one.row)
         return lambda: ui.link(words, address).props(f'aria-label="{words}: {one.row}"')
 
@@ -107,7 +109,10 @@ def _runs(visit: Visit, name: str, robot: Robot | None) -> None:
         ]
         for one in runs
     ]
-    draw.table((texts.WHEN, texts.RUN, texts.VERDICT, texts.PLAY, texts.REPORT), rows)
+    heads = (texts.WHEN, texts.RUN, texts.VERDICT, texts.PLAY, texts.REPORT)
+    draw.table(heads if any(map(has_log, runs)) else heads[:3], rows)
+    if not all(map(has_log, runs)):
+        draw.text(texts.NO_LOGS).classes("soft")
 
 
 class ReachPart:
@@ -119,7 +124,7 @@ class ReachPart:
         draw.heading(texts.REACH)
         with ui.row().classes("items-end gap-4"):
             motors = known.robot.motor_names
-            self._motor = draw.Choice(["", *motors], motor, texts.MOTOR)
+            self._motor = draw.Choice(["", *motors], motor, texts.MOTOR, words=_or_none)
             words = texts.ANGLE.format(unit=visit.unit_of(known.robot))
             at = motors.index(motor) if motor else 0
             start = visit.angle(angle, known.robot, at).split()[0]
@@ -136,13 +141,19 @@ class ReachPart:
         said = texts.ALL_REACHED.format(share=found.share)
         if found.motor:
             words = self._visit.angle(found.angle, robot, robot.motor_names.index(found.motor))
-            said = texts.REACHED.format(share=found.share, motor=found.motor, angle=words)
+            said = texts.REACHED.format(
+                share=found.share, motor=draw.spoken(found.motor), angle=words
+            )
         self._line.set_text(said)
         if self._scene is None:
             with self._place:
                 self._scene = ArmScene(robot, texts.REACH)
             self._scene.show(robot.resting_pose, robot.resting_pose, {})
         self._scene.points(found.points, found.reached)
+
+
+def _or_none(motor: str) -> str:
+    return draw.spoken(motor) or texts.NO_MOTOR
 
 
 def _reach(visit: Visit, known: CalibratedRobot, motor: str, told: float | None) -> Reach:
@@ -163,7 +174,9 @@ def held_angle(visit: Visit, robot: Robot, motor: str, told: float | None) -> fl
     angle, (low, high) = visit.held(float(told), robot, at), robot.travel[at].tolist()
     if not low - ROUNDED <= angle <= high + ROUNDED:
         ends = (visit.angle(end, robot, at) for end in (low, high))
-        raise InputError(texts.OUT_OF_RANGE.format(motor=motor, low=next(ends), high=next(ends)))
+        raise InputError(
+            texts.OUT_OF_RANGE.format(motor=draw.spoken(motor), low=next(ends), high=next(ends))
+        )
     return angle
 
 
@@ -210,10 +223,8 @@ class LivePage:
                 self._clock = draw.text("").classes("soft")
                 self._angles = parts.Angles(visit, robot)
                 ui.link(texts.REPLAY_LIVE, draw.link_to("replay", name=live.settings.name, run=0))
-            self._verdict = ui.element("section").props('aria-live="polite"')
             with ui.element("section"):
-                self._charts = Charts(self._known, with_posterior=True)
-            with ui.element("section"):
+                self._verdict = ui.element("div").props('aria-live="polite"')
                 draw.heading(texts.CHANGES)
                 self._changes = ui.element("div")
                 parts.asked(
@@ -222,6 +233,8 @@ class LivePage:
                     (texts.BLIND, texts.ASK_BLIND),
                     lambda: visit.desk.blind_spots(live.trace(), self._known),
                 )
+            with ui.element("section"):
+                self._charts = Charts(self._known, with_posterior=True)
         self._say()
         ui.timer(FRAME_S, self._frame)
         ui.timer(CHART_S, self._second)
@@ -252,8 +265,10 @@ class LivePage:
 
     def _say(self) -> None:
         """Tell the verdict, unless it stands there."""
-        view, tile = self._live.view, self._live.tile
-        said = (tile.state, tile.said, view.diagnosis, len(view.changes))
+        view, desk = self._live.view, self._visit.desk
+        tile = desk.tile(self._live.settings.name) or view.tile
+        alarms = desk.open_faults(tile.name)
+        said = (tile.state, tile.said, view.diagnosis, view.changes, alarms)
         if said == self._said:
             return
         self._said, words, robot = said, self._visit.words, self._known.robot
@@ -263,36 +278,46 @@ class LivePage:
             draw.badges(tile.states)
             draw.text(words(tile.said, robot))
             self._say_alarm(view)
+            self._say_stored(alarms)
             if view.diagnosis is not None:
                 trace = self._live.trace()
                 parts.reasons(self._visit, view.diagnosis, trace, robot, self._link)
             if view.diagnosis is not None or tile.state == shown.STALE:
-                parts.next_steps(self._visit, robot, tile, view.diagnosis)
+                parts.next_steps(self._visit, robot, tile, view.diagnosis, alarms)
             draw.heading(texts.MOTORS)
             rows = [
                 [
-                    one.name,
-                    one.state,
+                    draw.spoken(one.name),
+                    texts.STATES[STATES[one.state]],
                     percent(float(one.values.get("probability", 0))),
-                    words(one.message, robot),
+                    "" if one.state == OK else one.values.get("mode", "").replace("_", " "),
                 ]
                 for one in view.statuses[1:]
             ]
-            draw.table((texts.MOTOR, texts.STATE, texts.PROBABILITY, texts.SAYS), rows)
+            draw.table((texts.MOTOR, texts.STATE, texts.PROBABILITY, texts.FAULT), rows)
         self._changes.clear()
         with self._changes:
             for change in reversed(view.changes):
-                draw.text(words(str(change), robot))
+                draw.text(words(change, robot))
 
     def _say_alarm(self, view: LiveView) -> None:
-        episode, sample = view.alarm.episode, view.sample
-        if episode is None or episode.cleared_s is not None or sample is None:
+        episode = view.alarm.episode
+        if episode is None or episode.cleared_s is not None:
             return
-        raised = datetime.fromtimestamp(sample.read - (sample.time - episode.raised_s), UTC)
-        when = self._visit.time(raised, seconds=True)
-        draw.text(texts.ALARM_SINCE.format(time=when, number=episode.number))
+        told = texts.ALARM_SINCE.format(time=self._live.at(episode.raised_s), number=episode.number)
+        draw.text(self._visit.words(told, self._known.robot))
+
+    def _say_stored(self, alarms: Sequence[str]) -> None:
+        """Tell the open episodes of the store, each with a link to the history."""
+        name = self._live.settings.name
+        for one in self._visit.desk.open_episodes(name) if alarms else []:
+            when = self._visit.time(one.since, seconds=True)
+            said = {"time": when, "fault": one.fault, "state": one.state, "number": one.number}
+            address = draw.link_to("history", name=name)
+            ui.link(texts.STORED_SINCE.format(**said), address).classes("reason")
 
     def _link(self, reason: str, at: float) -> None:
         """Draw a link to a time [s]: unlike a button, it works while all is drawn anew."""
         address = draw.link_to("replay", name=self._live.settings.name, run=0, at=f"{at:.2f}")
-        ui.link(printable(reason), address).classes("reason")
+        link = ui.link(printable(reason), address).classes("reason")
+        link.props(f'name="{reason.partition(":")[0]}"')  # kept in focus while its figures change

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from failuretwin.app.console import texts
-from failuretwin.app.shadow import Change
 from failuretwin.connection.links.statuses import Status
 from failuretwin.core.foreign import printable
 from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, Alarm, Diagnosis, Hypothesis
@@ -18,12 +17,14 @@ from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.records import CHECK_DAYS
 from failuretwin.data_knowledge.records.overview import RobotGlance
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
-from failuretwin.inference.explanation import set_up_doubt
+from failuretwin.inference.explanation import plain_name, set_up_doubt
 
 ALARM, SUSPECTED, SET_UP, UNDECIDED, STALE, WAITING, HEALTHY = texts.STATES
 WORST_FIRST = (ALARM, SUSPECTED, SET_UP, UNDECIDED, STALE, WAITING, HEALTHY)
 SUSPECT = 0.05
 """Probability from which the drawn arm lets a motor differ from its command."""
+STAMP = "%Y-%m-%dT%H:%M:%SZ"
+"""Form of times (UTC) in texts, which pages show in the zone of their reader."""
 LONGEST_TEXT = 300
 """Length to which texts from logs are cut [letters]."""
 
@@ -66,6 +67,18 @@ class Tile:
     def states(self) -> tuple[str, ...]:
         """Its state, and `SET_UP` where its set-up is uncertain besides."""
         return (self.state, SET_UP) if self.set_up and self.state != SET_UP else (self.state,)
+
+    def alarmed(self, faults: Mapping[str, bool]) -> Tile:
+        """Return a live robot with the open episodes of the store that it does not tell itself."""
+        told = open_faults({name: sure for name, sure in faults.items() if not self.tells(name)})
+        if not told:
+            return self
+        state = ALARM if self.state in (HEALTHY, UNDECIDED, SUSPECTED, WAITING) else self.state
+        return replace(self, state=state, said=texts.STILL_OPEN.format(faults=told, said=self.said))
+
+    def tells(self, fault: str) -> bool:
+        """Return whether it names a fault, ``MOTOR:MODE``."""
+        return plain_name(Hypothesis.parse(fault)) in self.said
 
     def doubted(self, set_up: str) -> Tile:
         """Return it with what is to be said of its set-up; empty: nothing."""
@@ -118,7 +131,7 @@ class LiveView:
         statuses: Status of the arm, then of each motor.
         diagnosis: The diagnosis; None: none yet.
         alarm: The alarm.
-        changes: The last changes, the newest last.
+        changes: The last changes with their times, the newest last.
     """
 
     tile: Tile
@@ -127,7 +140,24 @@ class LiveView:
     statuses: Sequence[Status]
     diagnosis: Diagnosis | None
     alarm: Alarm
-    changes: Sequence[Change]
+    changes: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Time of day of a stream: `start` + `pace` t [s since 1970], with its own time t [s]."""
+
+    start: float
+    pace: float
+
+    def stamp(self, at: float) -> str:
+        """Return a time of the stream [s] as a time of day (UTC)."""
+        return f"{datetime.fromtimestamp(self.start + self.pace * at, UTC):{STAMP}}"
+
+
+def moment(clock: Clock | None, at: float) -> str:
+    """Return a time of a stream [s] in words: the time of day where it is known."""
+    return texts.STREAM_TIME.format(time=at) if clock is None else clock.stamp(at)
 
 
 @dataclass(frozen=True)
@@ -143,6 +173,7 @@ class Trace:
         diagnosis: Diagnosis of it; None: none.
         posterior: Times [s] and probabilities of hypotheses; empty: not followed over time.
         first: Number of the first of the movements.
+        clock: Time of day of its time; None: it was recorded some time.
     """
 
     name: str
@@ -153,6 +184,7 @@ class Trace:
     diagnosis: Diagnosis | None
     posterior: Sequence[tuple[float, Mapping[str, float]]] = ()
     first: int = 1
+    clock: Clock | None = None
 
 
 def worst_first(tiles: Sequence[Tile]) -> list[Tile]:
@@ -166,13 +198,17 @@ def modes_of(names: Sequence[str]) -> str:
     return ", ".join(sorted(found))
 
 
+def open_faults(faults: Mapping[str, bool]) -> str:
+    """Return faults of open episodes in words, given whether each is confirmed."""
+    return "; ".join(
+        f"{plain_name(Hypothesis.parse(name))}{' (confirmed)' if confirmed else ''}"
+        for name, confirmed in faults.items()
+    )
+
+
 def stored_tile(glance: RobotGlance, now: datetime) -> Tile:
     """Return a robot of the store. A robot without a run for `CHECK_DAYS` is stale."""
-    said = "; ".join(
-        f"{name.replace(':', ': ')}{' (confirmed)' if confirmed else ''}"
-        for name, confirmed in glance.faults.items()
-    )
-    said = said or glance.verdict
+    said = open_faults(glance.faults) or glance.verdict
     mode = modes_of(list(glance.faults))
     if glance.at is None:
         return Tile(glance.robot, glance.kind, WAITING, mode, texts.NEVER, None)

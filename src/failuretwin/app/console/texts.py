@@ -66,6 +66,8 @@ OPEN_ALARM = (
     "The alarm {fault!r} is still open, though the last run does not show this fault. Look at "
     "this motor too. Then confirm or reject the episode, or note its repair, on the history page."
 )
+STILL_OPEN = "alarm still open in the store: {faults}; now: {said}"
+STORED_SINCE = "open in the store since {time}: {fault}, {state} (episode {number})"
 OPEN_EPISODES = "Open episodes"
 VERDICT, SINCE, WHY, NEXT = "Verdict", "Since", "Why", "What to do now"
 ALARM_SINCE = "alarm number {number}, since {time}"
@@ -81,6 +83,7 @@ TOTAL = "tool error"
 ANGLES, TOLD, DRAWN = "Angles", "Told", "Drawn"
 BLIND, ASK_BLIND = "What the motion could not show", "Work it out"
 REACH, ASK_REACH, ANGLE = "What it can still reach", "Show", "Held at [{unit}]"
+NO_MOTOR = "none"
 OUT_OF_RANGE = "{motor} can stand from {low} to {high}. Fill in an angle between them."
 REACHED = "{share:.0%} of the usual workspace with {motor} held at {angle}"
 ALL_REACHED = "{share:.0%} of the usual workspace"
@@ -97,7 +100,11 @@ STREAM_TIME = "{time:.1f} s"
 WORKING, NOTHING = "Working ...", "nothing"
 
 RUNS, WHEN, RUN, PLAY = "Runs", "When", "Run", "Replay"
-NO_LOG = "its log is not on this computer"
+NO_LOG = "The log of this run is not on this computer. Put it back, or import it, to replay it."
+NO_LOGS = (
+    "Runs without links have no log on this computer: they were watched or simulated, or their log "
+    "was moved. Put a log back, or import it, to replay it."
+)
 SLIDER = "Time in the run"
 REPORT = "Page for technicians"
 PAUSE = "Pause"
@@ -109,7 +116,14 @@ FILL_IN = "Fill in the field {label!r} first."
 CONFIRM, REJECT, OTHER, UNDO = "Confirm", "Reject", "Other cause", "Undo"
 NOTE_REPAIR, REPAIR, UNDO_REPAIR = "Note a repair", "Repair", "Undo its last repair"
 RATES = "Learned rates of faults"
-RATE_COLUMNS = ("Fault", "Confirmed", "Times the assumed rate")
+RATE_NOTE = (
+    "All robots of this kind teach a rate, while their motor is about as old as that of this "
+    "robot. Age counts from the last repair, else from the first run."
+)
+RATE_COLUMNS = (
+    *("Fault", "Age of the motor", "Confirmed at this age", "Days at this age"),
+    *("Rate in 1000 h", "Times the assumed rate"),
+)
 COMPARE, THEN, NOW = "Compare two dates", "Then", "Now"
 OFFSET, CHANGE = "Offset", "Change"
 NO_OFFSETS = "No offsets are stored. `check` and `diagnose --track` store them."
@@ -132,12 +146,27 @@ GONE = "the page that started the check is closed, or hangs"
 BUSY = "A check is running. Wait for it, or stop it."
 STARTED, FINISHED = "the check of {robot} has begun", "the check is over"
 
-DROP = "Drop a log here, or choose one (.nc, .csv, .mat, .bag, .mcap)"
+DROP = "Drop a log here, or choose one ({endings})"
 DROP_LABEL = "Log file"
+READING = "Reading {name} ..."
 REFUSED = "refused: {why}"
+REJECTED = "The file is {limit}. Record a shorter log, or split it."
+OTHER_ENDING = "{name} is no log that can be read here. Expected a file that ends in {endings}."
+COLUMNS, READ_AGAIN = "Columns", "Read it again"
+FIELDS = {
+    "Add --columns MAP.toml: if that file does not exist yet, a guess is written there for you to "
+    "check.": f"The field {COLUMNS!r} below holds a guess: correct it, then read the log again.",
+    "a TOML file for --columns or in BagTopics in Python": f"the field {COLUMNS!r} below",
+    "--columns MAP.toml": f"the field {COLUMNS!r} below",
+    "--robot": "the field 'Profile'",
+    "columns.toml": f"field {COLUMNS!r}",
+}
+"""Fields of the page for logs, by the words of errors that mean them."""
 TOO_LARGE = "larger than {limit} MB"
 ROBOT_NAME, PROFILE = "Name of the robot in the store", "Profile"
-NOT_STORED = "Diagnosed, not stored: no robot was named, no store is open, or your role is `see`."
+NO_NAME = "Not stored: no robot is named. Fill in its name above, then drop the log again."
+NOT_BY_YOU = "Not stored: your role is {role!r}. Ask somebody whose role is 'confirm' to import it."
+NOWHERE_TO_STORE = "Not stored: no store is open. Start the console with --store."
 
 LOGIN, NAME, PASSWORD, SIGN_IN = "Sign in", "Name", "Password", "Sign in"
 WRONG = "Name or password is wrong."

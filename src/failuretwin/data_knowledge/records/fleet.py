@@ -118,8 +118,8 @@ class FleetFaults:
     confirmed: Mapping[str, int]
     by_age: Mapping[str, Sequence[AgeBand]] = field(default_factory=dict)
 
-    def at_risk(self, motor: str, age_h: float | None) -> tuple[float, Mapping[str, int]]:
-        """Return the time [h] and the confirmed faults that tell the rates of a motor.
+    def at_risk(self, motor: str, age_h: float | None) -> AgeBand:
+        """Return the time and the confirmed faults that tell the rates of a motor.
 
         Args:
             motor: The motor.
@@ -128,8 +128,8 @@ class FleetFaults:
         if age_h is not None:
             for band in self.by_age.get(motor, ()):
                 if band.low_h <= age_h < band.high_h:
-                    return band.hours, band.confirmed
-        return self.hours, self.confirmed
+                    return band
+        return AgeBand(0.0, float("inf"), self.hours, self.confirmed)
 
 
 def fleet_faults(connection: sa.Connection, kind: str) -> FleetFaults:

@@ -10,6 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from failuretwin.core.errors import counted
+from failuretwin.core.hypothesis import Fault
 from failuretwin.data_knowledge.records.episodes import CLEARED, CONFIRMED, RAISED, SUSPECTED
 from failuretwin.data_knowledge.records.offsets import Drift, read_drifts
 from failuretwin.data_knowledge.records.schema import (
@@ -25,6 +26,7 @@ from failuretwin.data_knowledge.records.schema import (
     runs,
     sessions,
 )
+from failuretwin.failure_behavior.registry import plain_fault
 
 RECENT = 20
 """Number of diagnoses, and of notes, that a history lists; other diagnoses are counted."""
@@ -84,6 +86,11 @@ class FaultEpisode:
         """The last finding that stands; None: none does."""
         standing = [one for one in self.findings if one.withdrawn_when is None]
         return standing[-1] if standing else None
+
+    @property
+    def fault(self) -> str:
+        """The fault as a person would say it."""
+        return plain_fault(Fault(self.motor, self.mode))
 
     @property
     def refuted(self) -> bool:
@@ -201,8 +208,7 @@ class History:
         """Return the same sentence with days in another zone."""
         if self.open_episodes:
             return "; ".join(
-                f"{one.motor}: {one.mode}, {one.state}, since {day(one.since)}"
-                for one in self.open_episodes
+                f"{one.fault}, {one.state}, since {day(one.since)}" for one in self.open_episodes
             )
         if not self.recent:
             return "no open fault" if self.notes else "no run has been diagnosed"
@@ -234,7 +240,7 @@ def _kind_of(diagnosis: StoredDiagnosis) -> str:
 
 def _moments_of(episode: FaultEpisode) -> list[Moment]:
     name = f"episode {episode.number}"
-    start = f"{name} begins: {episode.motor} {episode.mode}"
+    start = f"{name} begins: {episode.fault}"
     moments = [Moment(episode.since, "episode", start)]
     if episode.until is not None:
         moments.append(Moment(episode.until, "episode", f"{name} cleared"))
@@ -252,7 +258,7 @@ def _repair_text(repair: Repair) -> str:
     part = f"{repair.part} replaced" if repair.part else "repaired"
     note = f", {repair.note}" if repair.note else ""
     by = f" ({repair.person})" if repair.person else ""
-    return f"{repair.motor}: {part}{note}{by}"
+    return f"{repair.motor.replace('_', ' ')}: {part}{note}{by}"
 
 
 # Reading from the store.

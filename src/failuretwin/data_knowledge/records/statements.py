@@ -47,7 +47,7 @@ def add_finding(
             "`failuretwin found`."
         )
     of = {"episode_id": episode.row, "withdraws": standing and standing.number}
-    add_rows(connection, findings, [{**stated, **of, "at": datetime.now(UTC)}])
+    add_rows(connection, findings, [{**stated, **of}])
     return _episode(connection, row, robot, number)
 
 

@@ -271,6 +271,7 @@ class Store(StoreReader):
         cause: str = "",
         person: str = "",
         note: str = "",
+        at: datetime | None = None,
     ) -> FaultEpisode:
         """Store what a person found about an episode; the last finding that stands counts.
 
@@ -281,6 +282,7 @@ class Store(StoreReader):
             cause: The cause; needed for ``other cause``.
             person: Who found it.
             note: Anything else.
+            at: When (UTC); None: now.
 
         Raises:
             InputError: If there is no such robot, episode or verdict, or no cause.
@@ -289,7 +291,13 @@ class Store(StoreReader):
         check_name("finding", verdict, VERDICTS)
         if verdict == OTHER_CAUSE and not cause:
             raise InputError("an other cause has no name. State the cause that was found.")
-        stated = {"verdict": verdict, "cause": cause, "person": person, "note": note}
+        stated = {
+            "verdict": verdict,
+            "cause": cause,
+            "person": person,
+            "note": note,
+            "at": _or_now(at),
+        }
         with self._database.writing() as connection:
             return add_finding(connection, robot, episode, stated)
 
@@ -308,7 +316,13 @@ class Store(StoreReader):
             InputError: If there is no such robot or episode, or no finding that stands.
             OutputError: If it could not be stored.
         """
-        stated = {"verdict": "withdrawn", "cause": "", "person": person, "note": note}
+        stated = {
+            "verdict": "withdrawn",
+            "cause": "",
+            "person": person,
+            "note": note,
+            "at": _or_now(None),
+        }
         with self._database.writing() as connection:
             return add_finding(connection, robot, episode, stated, withdraw=True)
 
