@@ -80,7 +80,7 @@ def test_a_store_is_made_once_and_checked(run, store, tmp_path):
 def test_diagnoses_are_remembered_with_their_log(run, told, filled, rows, tmp_path):
     folder, printed = told
     assert "remembered in robots.db: 3 runs of arm_7\n" in printed
-    assert "episode 2: motor_2 steady_state_error, raised, since 2026-03-02 14:30\n" in printed
+    assert "episode 2: motor 2 misses its targets, raised, since 2026-03-02 14:30\n" in printed
     results = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
     names = ("diagnosis", "probability", "onset_s", "magnitude")
     stored = rows("SELECT hypothesis, probability, onset_s, magnitude FROM diagnoses ORDER BY id")

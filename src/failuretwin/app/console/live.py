@@ -24,7 +24,7 @@ from failuretwin.connection.links.base import OK, Answer, Item, Sink, Source
 from failuretwin.connection.links.statuses import BEFORE, UNDECIDED, statuses
 from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.foreign import printable
-from failuretwin.decision.streaming.fleet import MOVEMENTS, SILENCE_S
+from failuretwin.decision.streaming.fleet import SILENCE_S
 from failuretwin.decision.streaming.monitor import FaultMonitor
 from failuretwin.decision.streaming.set_up_watch import PROOF
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
@@ -96,7 +96,7 @@ class LiveRobot(Sink):
         self._posterior: deque[tuple[float, Mapping[str, float]]] = deque(
             maxlen=round(KEPT_S / POSTERIOR_S)
         )
-        self._starts: deque[float] = deque(maxlen=MOVEMENTS)
+        self._starts: deque[float] = deque(maxlen=KEPT)
         self._lines: deque[str] = deque(maxlen=SHOWN_CHANGES)
         self._begun = 0
         self._seen_s = np.inf
