@@ -49,7 +49,7 @@ def test_an_arm_without_flaws_goes_along_the_curve_that_it_is_told():
         HealthyModel.of(ROBOT, NO_IMPERFECTIONS), (HEALTHY,), ft.Priors()
     )
     runs = _motions(DigitalTwin(ROBOT), curve(0), TIME)
-    path = ideal.noise_free(runs, [[]])["measured"].values[0]
+    path = ideal.noise_free(runs, [[]], curves=True)["measured"].values[0]
     seen = np.isfinite(path).all(axis=-1)
     late = [np.interp(TIME - LOOP_S, TIME, one) for one in curve(0).T]
     wanted = DigitalTwin(ROBOT).path(np.stack(late, axis=-1)[seen])

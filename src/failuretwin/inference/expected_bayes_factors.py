@@ -41,7 +41,12 @@ from failuretwin.inference.movements.joint_likelihood import JointLikelihood, mo
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.observation.on_the_way import CURVED_RAD, likeliest_lag, on_the_way
+from failuretwin.inference.observation.on_the_way import (
+    CURVED_RAD,
+    hardly_rest,
+    likeliest_lag,
+    on_the_way,
+)
 from failuretwin.inference.observation.readings import measured_samples
 from failuretwin.inference.posterior import (
     check_diagnosable,
@@ -225,18 +230,18 @@ class ExpectedLogBayesFactor:
     def _fits(
         self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]], onset: FloatArray
     ) -> FloatArray:
-        evidence = Evidence(self.noise_free(runs, faults), self.model.settings, self.model.sensors)
-        seen = on_the_way(evidence, self.model, likeliest_lag(evidence, self.model))
-        moving = seen.on_the_way
-        found = np.empty((len(moving), len(self.hypotheses)))
-        for kind in np.unique(moving):
-            rows = np.flatnonzero(moving == kind)
-            found[rows] = (
-                self._fits_moving(seen.alike(rows))
-                if kind
-                else self._fits_at_rest(evidence, onset, rows)
-            )
+        evidence = self._evidence(self.noise_free(runs, faults))
+        hardly = hardly_rest(evidence, self.model)
+        found = np.empty((len(hardly), len(self.hypotheses)))
+        rest, move = np.flatnonzero(~hardly), np.flatnonzero(hardly)
+        if len(rest):
+            found[rest] = self._fits_at_rest(evidence, onset, rest)
+        if len(move):
+            found[move] = self._fits_moving(runs.isel(run=move), [faults[i] for i in move.tolist()])
         return found
+
+    def _evidence(self, runs: xr.Dataset) -> Evidence:
+        return Evidence(runs, self.model.settings, self.model.sensors)
 
     def _fits_at_rest(self, evidence: Evidence, onset: FloatArray, rows: IntArray) -> FloatArray:
         """Return how well the best member of each hypothesis fits some runs that rest."""
@@ -248,14 +253,23 @@ class ExpectedLogBayesFactor:
             [max_likelihood(likelihood, h, self.priors, first) for h in self.hypotheses], axis=1
         )
 
-    def _fits_moving(self, seen: SettledEvidence) -> FloatArray:
+    def _fits_moving(self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]]) -> FloatArray:
         """Return the log evidence of each hypothesis by moments on the way."""
+        evidence = self._evidence(self.noise_free(runs, faults, curves=True))
+        seen = on_the_way(evidence, self.model, likeliest_lag(evidence, self.model))
         return evidence_at_once(RunLikelihood(seen, self.model), self.hypotheses, self.priors)
 
-    def noise_free(self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]]) -> xr.Dataset:
-        """Return the runs as they would be seen if nothing were left to chance."""
+    def noise_free(
+        self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]], curves: bool = False
+    ) -> xr.Dataset:
+        """Return the runs as they would be seen if nothing were left to chance.
+
+        With `curves` the motors go along commands that are no ramps, without a rest in between.
+        """
         twin, time = self.model.twin, as_floats(runs["time"].values)
-        movements, faults = _as_commanded(runs, faults)
+        movements = commanded(runs)
+        if curves:
+            movements, faults = _along_curves(runs, movements, faults)
         path = noise_free_path(
             twin,
             self.model.imperfections,
@@ -278,16 +292,15 @@ KNOT_S = 0.04
 """Time between the corners of lines that stand for a command that is no ramp [s]."""
 
 
-def _as_commanded(
-    runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]]
+def _along_curves(
+    runs: xr.Dataset, told: Movements, faults: Sequence[Sequence[FaultValue]]
 ) -> tuple[Movements, Sequence[Sequence[FaultValue]]]:
     """Return movements that go where runs were told to go, and faults with values for each.
 
     A curve is one movement of the run set. Here it is many short ramps, which share what a fault
     draws for the movement.
     """
-    told, time = commanded(runs), as_floats(runs["time"].values)
-    command = as_floats(runs["command"].values)
+    time, command = as_floats(runs["time"].values), as_floats(runs["command"].values)
     if np.abs(told.reference(time) - command).max(initial=0.0) <= CURVED_RAD:
         return told, faults
     step = max(1, round(KNOT_S / (time[1] - time[0])))
