@@ -32,7 +32,7 @@ def person(browser, server):
 
 
 def rate_of(person, fault):
-    row = person.find(f"//tr[td[normalize-space()='{fault}']]")
+    row = person.find(f"//tr[td[1][normalize-space()='{fault}']]")
     return float(row.find_elements("tag name", "td")[-1].text)
 
 
