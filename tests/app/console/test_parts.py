@@ -12,6 +12,7 @@ pytest.importorskip("nicegui")
 
 from failuretwin.app.console import (
     act,
+    charts,
     demo,
     history,
     live,
@@ -126,6 +127,23 @@ def test_only_the_suspected_motor_of_the_drawn_arm_differs(armpi):
     assert np.argmin(left) == 2
     assert left[2] < 1e-5
     assert left[-1] == pytest.approx(np.linalg.norm(tool - arm.tool(command[None])[0][0]))
+
+
+def test_lines_are_not_drawn_across_times_without_readings(armpi):
+    time_s = np.r_[np.arange(0.0, 1.0, 0.1), np.arange(5.0, 6.0, 0.1)]
+    command = np.zeros((len(time_s), 4))
+    tool, _ = InverseKinematics.of(armpi).tool(command)
+    trace = state.Trace("run", time_s, command, tool, np.zeros(0), None)
+    measured, commanded = charts.tool_lines(trace, calibrated(armpi), -np.inf)[:2]
+    assert measured[1][np.isnan(measured[2])] == pytest.approx([2.95])
+    assert np.isfinite(commanded[2]).all()
+    for _, at, value in charts.residual_lines(trace, InverseKinematics.of(armpi), -np.inf):
+        assert at[np.isnan(value)] == pytest.approx([2.95])
+
+
+@pytest.mark.parametrize("time_s", [[], [1.0], [0.0, 0.1, 0.2]])
+def test_readings_without_a_gap(time_s):
+    assert len(charts.silences(np.array(time_s))) == 0
 
 
 HEALTHY = Diagnosis("", {"healthy": 1.0, "motor_3:stuck": 0.0})

@@ -86,6 +86,8 @@ class CheckPage:
         with ui.row().classes("gap-4 items-center"):
             if visit.session.may(MOVE):
                 draw.button(texts.START, self._start)
+            else:
+                draw.text(texts.START_NOT_ALLOWED.format(role=MOVE))
             # A form: it works without scripts, so also when the page hangs.
             with ui.element("form").props('method="post" action="/stop" target="stop"'):
                 stop = draw.text(texts.STOP, "button").props('type="submit"')

@@ -20,6 +20,8 @@ MOST_POINTS = 600
 """Points of a chart."""
 RESIDUAL_POINTS = 60
 """Points of the chart of residuals: each is solved for."""
+GAP = 10.0
+"""A sensor that is silent for so many times its usual distance of readings leaves a gap."""
 MOST_LINES = 6
 """Hypotheses of the chart of probabilities."""
 INTERESTING = 0.01
@@ -50,13 +52,31 @@ def posterior_lines(trace: Trace, since_s: float) -> list[Line]:
     ]
 
 
+def silences(time: FloatArray) -> FloatArray:
+    """Return the middles of the gaps between readings, given the times of readings [s]."""
+    if len(time) < 2:
+        return np.zeros(0)
+    distance = np.diff(time)
+    long = distance > GAP * np.median(distance)
+    return np.asarray(time[:-1][long] + 0.5 * distance[long])
+
+
+def _broken(line: Line, silent: FloatArray) -> Line:
+    """Return a line that is not drawn across times [s] at which the sensor was silent."""
+    name, time, value = line
+    at = np.searchsorted(time, silent)
+    return name, np.insert(time, at, silent), np.insert(value, at, np.nan)
+
+
 def residual_lines(trace: Trace, arm: InverseKinematics, since_s: float) -> list[Line]:
     """Return what remains of the tool error with each motor, over time [mm]."""
     rows = np.flatnonzero((trace.time >= since_s) & np.isfinite(trace.measured).all(axis=1))
+    silent = silences(trace.time[rows])
     rows = rows[:: max(1, len(rows) // RESIDUAL_POINTS)]
     value = 1e3 * shown.residuals(arm, trace.command[rows], trace.measured[rows])
     names = [*map(draw.spoken, arm.robot.motor_names), texts.TOTAL]
-    return [(name, trace.time[rows], one) for name, one in zip(names, value.T, strict=True)]
+    lines = [(name, trace.time[rows], one) for name, one in zip(names, value.T, strict=True)]
+    return [_broken(line, silent) for line in lines]
 
 
 def tool_lines(trace: Trace, known: CalibratedRobot, since_s: float) -> list[Line]:
@@ -64,8 +84,10 @@ def tool_lines(trace: Trace, known: CalibratedRobot, since_s: float) -> list[Lin
     rows = trace.time >= since_s
     seen = rows & np.isfinite(trace.measured).all(axis=1)
     path, lines = known.twin.path(trace.command[rows]), list[Line]()
+    silent = silences(trace.time[seen])
     for k, axis in enumerate("xyz"):
-        lines.append((axis, trace.time[seen], 1e3 * trace.measured[seen, k]))
+        measured = axis, trace.time[seen], 1e3 * trace.measured[seen, k]
+        lines.append(_broken(measured, silent))
         lines.append((axis, trace.time[rows], 1e3 * path[:, k]))
     return lines
 
@@ -138,7 +160,8 @@ def _series(lines: list[Line]) -> list[dict[str, Any]]:
     names = list(dict.fromkeys(name for name, _, _ in lines))
     made: list[dict[str, Any]] = []
     for name, time, value in lines:
-        step = max(1, len(time) // MOST_POINTS)
+        drawn = np.arange(len(time)) % max(1, len(time) // MOST_POINTS) == 0
+        drawn |= np.isnan(value)
         style = {"color": COLOURS[names.index(name) % len(COLOURS)]}
         if any(one["name"] == name for one in made):
             style["type"] = "dashed"
@@ -150,7 +173,7 @@ def _series(lines: list[Line]) -> list[dict[str, Any]]:
             "itemStyle": {"color": style["color"]},
             "data": [
                 [round(t, 2), None if np.isnan(v) else round(v, 4)]
-                for t, v in zip(time[::step].tolist(), value[::step].tolist(), strict=True)
+                for t, v in zip(time[drawn].tolist(), value[drawn].tolist(), strict=True)
             ],
         })  # fmt: skip
     return made

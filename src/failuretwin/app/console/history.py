@@ -48,11 +48,12 @@ class HistoryPage:
         self._visit, self._name, self._store = visit, name, store
         self._repaired = ""
         signed = visit.session.name
-        with ui.row().classes("gap-4 items-end"):
+        with ui.row().classes("gap-4 items-end") as fields:
             self._person = _field(texts.YOUR_NAME, signed)
             if signed:
                 self._person.props("readonly")
             self._note, self._cause = _field(texts.NOTE), _field(texts.CAUSE)
+        fields.set_visibility(visit.confirms)
         self._body = ui.element("div")
         self._draw()
 

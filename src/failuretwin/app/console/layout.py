@@ -59,10 +59,12 @@ table.plain { border-collapse: collapse; width: 100%; }
 table.plain th, table.plain td { text-align: left; padding: .25rem .6rem; vertical-align: top;
   border-bottom: 1px solid var(--line); overflow-wrap: break-word; }
 table.plain td:first-child { white-space: nowrap; }
+table.plain .q-btn { margin: .2rem .3rem .2rem 0; }
 @media (max-width: 599px) { table.plain thead { display: none; }
   table.plain tr { display: block; border-bottom: 1px solid var(--line); padding: .3rem 0; }
   table.plain td { display: flex; gap: .6rem; border: 0; padding: .1rem 0; }
-  table.plain td:empty { display: none; } table.plain .q-btn { margin: .2rem .3rem .2rem 0; }
+  table.plain td:has(.q-btn) { flex-wrap: wrap; gap: 0; }
+  table.plain td:empty { display: none; }
   table.plain td::before { content: attr(data-label); flex: 0 0 7rem; opacity: .85; } }
 .state { color: #fff; border-radius: .3rem; padding: 0 .5rem; display: inline-block; }
 .choice { font-size: 1rem; border: 1px solid #6b757e; border-radius: .3rem; padding: .3rem .4rem;

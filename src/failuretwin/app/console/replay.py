@@ -104,7 +104,7 @@ class Replay:
         near = seen[np.argmin(np.abs(trace.time[seen] - at))] if len(seen) else k
         diagnosis, motors = self._diagnosis_at(at), self._robot.motor_names
         suspects = shown.suspected_motors(motors, diagnosis)
-        pose = shown.seen_pose(self._arm, trace.command[k], trace.measured[near], suspects)
+        pose = shown.seen_pose(self._arm, trace.command[near], trace.measured[near], suspects)
         self._scene.show(pose, trace.command[k], shown.motor_shares(motors, diagnosis))
         self._angles.show(trace.command[k], pose)
         told = self._visit.words(shown.moment(trace.clock, at), None)
