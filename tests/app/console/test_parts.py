@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import time
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
@@ -112,6 +113,27 @@ def test_a_fleet_whose_worker_is_silent_is_stale():
     (fresh,), (late,) = (state.fleet_tiles(status, {}, now) for now in (101.0, 200.0))
     assert (fresh.state, late.state) == (state.HEALTHY, state.STALE)
     assert late.said == "last word: healthy"
+
+
+def test_a_stuck_motor_is_drawn_where_it_is_held_while_the_others_trail(armpi):
+    arm, motors = InverseKinematics.of(armpi), armpi.motor_names
+    command = np.array([0.3, 0.4, -0.5, 0.6])
+    trailing = command - np.array([0.2, 0.1, 0.0, 0.3])
+    trailing[2] = 0.1
+    found = Diagnosis(
+        "",
+        {"healthy": 0.01, "motor_3:stuck": 0.99},
+        diagnosis="motor_3:stuck",
+        magnitude=0.1,
+        magnitude_unit="rad",
+    )
+    suspect = state.suspected_motors(motors, found)
+    held = state.held_motor(motors, suspect, found)
+    drawn = state.seen_pose(arm, command, arm.tool(trailing[None])[0][0], suspect, held)
+    assert drawn == pytest.approx([0.3, 0.4, 0.1, 0.6])
+    assert state.held_motor(motors, ~suspect, found) is None
+    off = replace(found, diagnosis="motor_3:steady_state_error")
+    assert state.held_motor(motors, suspect, off) is None
 
 
 def test_only_the_suspected_motor_of_the_drawn_arm_differs(armpi):

@@ -104,7 +104,9 @@ class Replay:
         near = seen[np.argmin(np.abs(trace.time[seen] - at))] if len(seen) else k
         diagnosis, motors = self._diagnosis_at(at), self._robot.motor_names
         suspects = shown.suspected_motors(motors, diagnosis)
-        pose = shown.seen_pose(self._arm, trace.command[near], trace.measured[near], suspects)
+        held = shown.held_motor(motors, suspects, trace.diagnosis)
+        seen_there = trace.command[near], trace.measured[near]
+        pose = shown.seen_pose(self._arm, *seen_there, suspects, held)
         self._scene.show(pose, trace.command[k], shown.motor_shares(motors, diagnosis))
         self._angles.show(trace.command[k], pose)
         told = self._visit.words(shown.moment(trace.clock, at), None)

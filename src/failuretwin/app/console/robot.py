@@ -247,7 +247,8 @@ class LivePage:
             return
         motors = self._known.robot.motor_names
         suspects = shown.suspected_motors(motors, view.diagnosis)
-        pose = shown.seen_pose(self._arm, sample.command, sample.tool, suspects)
+        held = shown.held_motor(motors, suspects, view.diagnosis)
+        pose = shown.seen_pose(self._arm, sample.command, sample.tool, suspects, held)
         self._scene.show(pose, sample.command, shown.motor_shares(motors, view.diagnosis))
         self._poses = sample.command, pose
         read = datetime.fromtimestamp(sample.read, UTC)

@@ -17,6 +17,8 @@ from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.records import CHECK_DAYS
 from failuretwin.data_knowledge.records.overview import RobotGlance
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
+from failuretwin.failure_behavior.mode import Signature
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.explanation import plain_name, set_up_doubt
 
 ALARM, SUSPECTED, SET_UP, UNDECIDED, STALE, WAITING, HEALTHY = texts.STATES
@@ -280,13 +282,35 @@ def motor_shares(motors: Sequence[str], diagnosis: Diagnosis | None) -> dict[str
     return shares
 
 
+def held_motor(
+    motors: Sequence[str], suspects: BoolArray, diagnosis: Diagnosis | None
+) -> tuple[int, float] | None:
+    """Return a stuck motor and its angle [rad], if it is suspected; None: none has a known one."""
+    if diagnosis is None or diagnosis.undecided or diagnosis.magnitude is None:
+        return None
+    for fault in Hypothesis.parse(diagnosis.diagnosis or "healthy").faults:
+        held = MODES[fault.mode].signature is Signature.HELD
+        if held and fault.motor in motors and suspects[motors.index(fault.motor)]:
+            return motors.index(fault.motor), diagnosis.magnitude
+    return None
+
+
 def seen_pose(
-    arm: InverseKinematics, command: FloatArray, tool: FloatArray, suspects: BoolArray
+    arm: InverseKinematics,
+    command: FloatArray,
+    tool: FloatArray,
+    suspects: BoolArray,
+    held: tuple[int, float] | None = None,
 ) -> FloatArray:
     """Return the pose nearest to a command that brings the tool to where it is, (motor,) [rad].
 
-    Only suspected motors differ from the command, if there are any.
+    Only suspected motors differ from the command, if there are any. A motor that is held somewhere
+    stands there: while the arm moves, what the others trail behind would be taken for its angle.
     """
+    if held is not None:
+        pose = command.copy()
+        pose[held[0]] = held[1]
+        return pose
     if not np.isfinite(tool).all():
         return command
     locked = ~suspects if suspects.any() else None
