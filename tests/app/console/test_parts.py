@@ -123,7 +123,6 @@ def test_a_stuck_motor_is_drawn_where_it_is_held_while_the_others_trail(armpi):
     found = Diagnosis(
         "",
         {"healthy": 0.01, "motor_3:stuck": 0.99},
-        diagnosis="motor_3:stuck",
         magnitude=0.1,
         magnitude_unit="rad",
     )
@@ -132,7 +131,7 @@ def test_a_stuck_motor_is_drawn_where_it_is_held_while_the_others_trail(armpi):
     drawn = state.seen_pose(arm, command, arm.tool(trailing[None])[0][0], suspect, held)
     assert drawn == pytest.approx([0.3, 0.4, 0.1, 0.6])
     assert state.held_motor(motors, ~suspect, found) is None
-    off = replace(found, diagnosis="motor_3:steady_state_error")
+    off = replace(found, posterior={"healthy": 0.01, "motor_3:steady_state_error": 0.99})
     assert state.held_motor(motors, suspect, off) is None
 
 
