@@ -16,9 +16,8 @@ from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, Alarm, Diag
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.records import CHECK_DAYS
 from failuretwin.data_knowledge.records.overview import RobotGlance
+from failuretwin.decision.streaming.set_up_watch import is_held
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
-from failuretwin.failure_behavior.mode import Signature
-from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.explanation import plain_name, set_up_doubt
 
 ALARM, SUSPECTED, SET_UP, UNDECIDED, STALE, WAITING, HEALTHY = texts.STATES
@@ -289,9 +288,9 @@ def held_motor(
     if diagnosis is None or diagnosis.undecided or diagnosis.magnitude is None:
         return None
     for fault in Hypothesis.parse(diagnosis.diagnosis or "healthy").faults:
-        held = MODES[fault.mode].signature is Signature.HELD
-        if held and fault.motor in motors and suspects[motors.index(fault.motor)]:
-            return motors.index(fault.motor), diagnosis.magnitude
+        motor = motors.index(fault.motor) if fault.motor in motors else None
+        if is_held(str(fault)) and motor is not None and suspects[motor]:
+            return motor, diagnosis.magnitude
     return None
 
 

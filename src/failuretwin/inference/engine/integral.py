@@ -249,13 +249,15 @@ def _whitened_of_three(
 
 
 @inlined
-def _write_glance(three: bool, moment: Moment, noise: Noise, room: Room, glance: FloatArray) -> int:
+def _write_glance(
+    three: bool, moment: Moment, noise: Noise, room: Room, glance: FloatArray
+) -> float:
     """Write log weight and density of each outcome, what is left of f as scatter.
 
     Returns:
-        The likeliest outcome.
+        The largest.
     """
-    best, (residual, scale, log_weight, mean, covariance) = 0, moment
+    largest, (residual, scale, log_weight, mean, covariance) = -np.inf, moment
     precision, pull = room
     for a in range(len(glance)):
         glance[a] = -np.inf
@@ -264,9 +266,8 @@ def _write_glance(three: bool, moment: Moment, noise: Noise, room: Room, glance:
                 three, residual, scale, mean, covariance, a, 1.0, precision, pull
             )
             glance[a] = log_weight[a] + log_density(noise, square, determinant)
-        if glance[a] > glance[best]:
-            best = a
-    return best
+        largest = max(largest, glance[a])
+    return largest
 
 
 @inlined
@@ -365,8 +366,7 @@ def _integral(
     """Do what `moment_integral` does; whether there are three channels is told as a constant."""
     count, size = len(share), len(alpha)
     room = np.empty((size, size)), np.empty(size)
-    best = _write_glance(three, moment, noise, room, share)
-    top = max(share[best], noise.log_outlier)
+    top = max(_write_glance(three, moment, noise, room, share), noise.log_outlier)
     alpha[:], curvature[:] = 0.0, 0.0
     exact, rough = _add_outcomes(three, moment, noise, room, top, share, alpha, curvature)
     # What is left of f counts as scatter at the glance: wrong by as much for the others.
