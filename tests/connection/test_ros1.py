@@ -82,6 +82,35 @@ def test_a_master_that_is_killed_and_restarted_is_no_trouble(armpi, roscore):
         listener.close()
 
 
+def test_what_was_published_before_the_end_arrives(monkeypatch, armpi, peer):
+    """The last order of a check is to stand still; the transport is closed right after it."""
+    topic, times = "/diagnostics", np.arange(1000.0, 1020.0).tolist()
+    peer.ask(op="listen", type="diagnostic_msgs/DiagnosticArray", topic=topic)
+    with Ros1Transport() as transport:
+        RosSink(DiagnosticsWriter(armpi, STANDARD), transport)
+        wait_for(lambda: transport.is_heard(topic))
+        let_the_network_be_slow(monkeypatch, transport, topic)
+        for t in times:
+            # A writer of its own: nothing is left out for coming too soon.
+            writer = DiagnosticsWriter(armpi, STANDARD)
+            diagnosis = Diagnosis("live", {"healthy": 1.0}, verdict="healthy")
+            for message in writer.messages(Answer(t, OK, diagnosis)):
+                transport.publish(message)
+    wait_for(lambda: [status["stamp"] for status in peer.ask(op="heard", topic=topic)] == times)
+
+
+def let_the_network_be_slow(monkeypatch, transport, topic):
+    """Let each message of a topic need 20 ms on its way to its listener."""
+    (link,) = transport._publishers[topic].impl.connections
+    write = link._connection.write_data
+
+    def slowly(data):
+        time.sleep(0.02)
+        return write(data)
+
+    monkeypatch.setattr(link._connection, "write_data", slowly)
+
+
 def test_a_robot_comes_back_with_its_topics(armpi, roscore):
     with Ros1Transport() as transport:
         sink = RosSink(RosWriter(armpi, STANDARD), transport)

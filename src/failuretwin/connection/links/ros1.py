@@ -10,6 +10,7 @@ import logging
 import os
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.client import HTTPConnection
@@ -26,7 +27,9 @@ DEBIAN_FOLDER = "/usr/lib/python3/dist-packages"
 NODE = "failuretwin"
 DEFAULT_URI = "http://localhost:11311"
 TIMEOUT_S = 2.0
-"""Longest wait for an answer of the master [s]."""
+"""Longest wait for an answer of the master, and for listeners at the end [s]."""
+FLUSH_S = 0.01
+"""Time between two looks at whether all is written [s]."""
 CHECK_S = 1.0
 """Time between two questions to the master [s]."""
 QUEUE = 100
@@ -111,6 +114,17 @@ def _join() -> Any:
     return rospy
 
 
+def _is_written(link: Any) -> bool:
+    """Return whether a link has written all that was published, or is gone.
+
+    A thread of rospy writes what waits, and unregistering its topic would end it. It has written
+    all when it waits for more.
+    """
+    with link._lock:
+        idle = not link._queue and bool(link._cond_data_available._waiters)
+    return idle or link.done
+
+
 def message_class(codec: RosCodec, type_: str) -> Any:
     """Return a class of messages that rospy publishes as the bytes in `_buff`."""
     definition, md5 = codec.definition(type_)
@@ -173,9 +187,17 @@ class Ros1Transport(Transport):
         publisher.publish(content)
 
     def close(self) -> None:
-        """End all subscriptions and publishers; the process stays a node."""
+        """End all subscriptions and publishers; the process stays a node.
+
+        What was published is written first, such as the order to stand still.
+        """
         self._stop.set()
         self._thread.join()
+        deadline = time.monotonic() + TIMEOUT_S
+        links = chain.from_iterable(item.impl.connections for item in self._publishers.values())
+        for link in list(links):
+            while not _is_written(link) and time.monotonic() < deadline:
+                time.sleep(FLUSH_S)
         for handle in (*self._subscribers, *self._publishers.values()):
             handle.unregister()
 
