@@ -15,6 +15,7 @@ Section: docs/fleet.md
 
 from __future__ import annotations
 
+import asyncio
 import ssl
 from contextlib import suppress
 from dataclasses import dataclass
@@ -52,6 +53,8 @@ ANSWER_S = 5.0
 """Longest wait for the entries of a bucket [s]."""
 TRIES_S = 2.0
 """Time between two tries to reach a server that is gone [s]."""
+GOODBYE_S = 1.0
+"""Longest wait for the end of a connection that was refused [s]."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +207,7 @@ async def open_broker(access: Access, name: str) -> Broker:
         InputError: If the server does not answer, or refuses us.
     """
     with needs_extra("a fleet needs nats-py", "fleet"):
-        import nats
+        from nats.aio.client import Client
         from nats.errors import Error
     options: dict[str, Any] = {}
     if access.nkey is not None:
@@ -216,18 +219,20 @@ async def open_broker(access: Access, name: str) -> Broker:
     async def note(error: Exception) -> None:
         seen.append(error)
 
+    client = Client()
     try:
-        client = await nats.connect(
+        await client.connect(
             access.url,
             name=name,
             error_cb=note,
             connect_timeout=5,
-            reconnect_time_wait=0.2,
             max_reconnect_attempts=1,
             allow_reconnect=False,
             **options,
         )
     except (Error, OSError, TimeoutError) as error:
+        with suppress(TimeoutError):  # nats-py waits for ever where TLS has failed
+            await asyncio.wait_for(client.close(), GOODBYE_S)
         raise InputError(
             f"fleet server {access.shown}: {seen[-1] if seen else error}. Expected a NATS server "
             "with JetStream that lets us in; see docs/fleet.md."
