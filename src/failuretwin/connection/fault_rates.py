@@ -127,11 +127,13 @@ class LearnedRates:
         """What they rest on, in a line: the counts of the rates themselves."""
         seen, most = self.seen, max(self.rates, key=lambda rate: rate.mean_per_h, default=None)
         used, every = sum(rate.confirmed for rate in self.rates), sum(seen.confirmed.values())
-        told = (
-            f"{counted(used, 'confirmed fault')} of {counted(seen.robots, 'robot')} ({seen.kind})"
-        )
+        robots = f"{counted(seen.robots, 'robot')} ({seen.kind})"
+        told = f"{counted(used, 'confirmed fault')} of {robots}"
         if used < every:
-            told += f", of {every} in all: motors of the ages of this robot's count"
+            told = (
+                f"{used} of {counted(every, 'confirmed fault')} of {robots}, those of motors as "
+                "old as this robot's"
+            )
         if most is None or not used:
             return told
         low, high = 1000.0 * most.interval_per_h

@@ -93,11 +93,11 @@ class RemainingLife:
                 f"the next {AHEAD * self.seen:.0f} runs"
             )
         low, middle, high = (self.quantile(share) for share in (0.05, 0.5, 0.95))
-        late = f"{high:.0f}" if np.isfinite(high) else "never"
+        if np.isinf(high):
+            return f"cannot tell when it ends: at least {low:.0f} runs left (95 %)"
         if high > max(VAGUE * low, AHEAD * self.seen):
-            return f"cannot tell when it ends: {low:.0f} to {late} runs left (90 %)"
-        half = f"{middle:.0f}" if np.isfinite(middle) else "never"
-        return f"about {half} runs left (90 %: {low:.0f} to {late})"
+            return f"cannot tell when it ends: {low:.0f} to {high:.0f} runs left (90 %)"
+        return f"about {middle:.0f} runs left (90 %: {low:.0f} to {high:.0f})"
 
     def to_progpy(self, event: str = "worn out") -> list[dict[str, float]]:
         """Return samples of the time of event for ``progpy.uncertain_data.UnweightedSamples``."""

@@ -162,6 +162,14 @@ def test_lines_are_not_drawn_across_times_without_readings(armpi):
         assert at[np.isnan(value)] == pytest.approx([2.95])
 
 
+def test_a_movement_ends_before_the_next_begins():
+    time_s, still = np.array([3.0, 3.5, 4.0, 4.5, 6.0]), np.zeros((5, 4))
+    starts = np.array([2.0, 3.0, 4.2, 5.0, 5.5])
+    trace = state.Trace("live", time_s, still, still[:, :3], starts, None, first=7)
+    ends = [trace.end_of(number) for number in range(6, 13)]
+    assert ends == [None, None, 4.0, 4.5, None, 6.0, None]
+
+
 @pytest.mark.parametrize("time_s", [[], [1.0], [0.0, 0.1, 0.2]])
 def test_readings_without_a_gap(time_s):
     assert len(charts.silences(np.array(time_s))) == 0

@@ -32,12 +32,11 @@ def reasons(
     robot: Robot,
     movement: Callable[[str, float], object],
 ) -> None:
-    """Draw why; `movement` draws a reason that leads to its time [s]."""
+    """Draw why; `movement` draws a reason that leads to the end of its movement [s]."""
     draw.heading(texts.WHY)
-    starts = dict(enumerate(trace.movements.tolist(), start=trace.first))
     for line in diagnosis.explanation:
         found = MOVEMENT.match(line)
-        at = starts.get(int(found[1])) if found else None
+        at = trace.end_of(int(found[1])) if found else None
         if at is not None:
             movement(visit.words(line, robot), at)
         elif not line.startswith(STEP):

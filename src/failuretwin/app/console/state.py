@@ -187,6 +187,17 @@ class Trace:
     first: int = 1
     clock: Clock | None = None
 
+    def end_of(self, movement: int) -> float | None:
+        """Return the last time before the next movement, when a motor rests [s].
+
+        None: the trace does not hold the movement, or nothing of it.
+        """
+        bounds = np.searchsorted(self.time, np.append(self.movements, np.inf))
+        k = movement - self.first
+        if not 0 <= k < len(self.movements) or bounds[k] == bounds[k + 1]:
+            return None
+        return float(self.time[bounds[k + 1] - 1])
+
 
 def worst_first(tiles: Sequence[Tile]) -> list[Tile]:
     """Return tiles by health, then by name."""
