@@ -62,7 +62,7 @@ def test_ninety_runs_with_the_bundled_calibration(told, how, whole, right, score
     assert reached == pytest.approx(score, rel=SCORE_BAND)
 
 
-@pytest.mark.parametrize(("how", "angles", "onsets"), [("measured", 34, 32), ("published", 35, 31)])
+@pytest.mark.parametrize(("how", "angles", "onsets"), [("measured", 34, 33), ("published", 37, 33)])
 def test_intervals_of_stuck_motors_hold_as_many_as_they_did(real, told, how, angles, onsets):
     """Of 40, give or take one; intervals of 90 % that are too wide hold too many."""
     truth = real[how][["magnitude", "onset"]].to_dataarray().values

@@ -8,11 +8,12 @@ Section: docs/inference.md#hypotheses
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import ndtri
 
 from failuretwin.core.numerics import log_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.inference.engine.moved_motor import FREE_RAD, Angle, MovedMotor
-from failuretwin.inference.engine.rows import Rows, Scene
+from failuretwin.inference.engine.rows import Onsets, Rows, Scene, sampled
 from failuretwin.inference.faults.priors import OnsetIntervals, plateau_or_ramp
 
 GRID = 61
@@ -25,8 +26,12 @@ BEYOND = 0.1
 """Share of its travel by which a motor may be held beyond its ends."""
 POINTS = np.linspace(0.05, 0.95, 10)
 """Where in a stretch of time onsets are sampled, as shares of its length."""
-LAG_DOUBT_S = 0.03
-"""Deviation of one motor's lag about the mean of the robot [s]: it widens the onset's interval."""
+NORMAL_QUANTILES = ndtri(POINTS)
+"""The same of a normal distribution, in deviations."""
+STILL_RAD = 1e-6
+"""A ramp that is shorter is none [rad]."""
+OFF_RAMP = 0.05
+"""Share of a ramp by which a held angle may be beyond its ends and still be on it."""
 
 
 def held_rows(scene: Scene, motor: int) -> Rows:
@@ -69,11 +74,11 @@ def held_rows(scene: Scene, motor: int) -> Rows:
         normal = -0.5 * ((x - centre[run, row, None]) ** 2 / width + np.log(2.0 * np.pi * width))
         return np.where(tied[row, None], normal, ramp)
 
-    onset = _stuck_onsets(intervals, was, goal, centre)
+    onsets = _stuck_onsets(scene, motor, intervals, was, goal)
     if known is not None:
-        onset = np.full_like(onset[0], known), onset[1]
+        onsets = sampled(np.full((*centre.shape, 1), known), np.ones((*centre.shape, 1)))
     return moving.rows(
-        centre, variance, _flat(log_prior[..., 0], log_prior[..., 1]), amount_prior, onset
+        centre, variance, _flat(log_prior[..., 0], log_prior[..., 1]), amount_prior, onsets
     )
 
 
@@ -111,20 +116,34 @@ def stuck_intervals(scene: Scene, motor: int) -> OnsetIntervals:
 
 
 def _stuck_onsets(
-    intervals: OnsetIntervals, was: FloatArray, goal: FloatArray, centre: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return samples of the onset of each row: anywhere on a plateau, on a ramp where it stands."""
+    scene: Scene, motor: int, intervals: OnsetIntervals, was: FloatArray, goal: FloatArray
+) -> Onsets:
+    """Return the onset of each row: anywhere on a plateau, on a ramp when it passed the angle.
+
+    On a ramp of length T from `was` to `goal`, held at x give or take d, with lag give or take l,
+
+        t = begin + T (x - was) / (goal - was),    var(t) = T^2 (d^2 + s^2) / (goal - was)^2 + l^2
+
+    with s the scatter of the motor about its command.
+    """
+    model = scene.model
     begin, length = np.nan_to_num(intervals.begin), intervals.length
-    onset = begin[..., None] + POINTS * length[..., None]  # (run, moment, part, sample)
-    travel = goal - was
-    safe = np.where(np.abs(travel) > 1e-6, travel, 1.0)
-    free = centre.reshape(*was.shape, 2)[..., 1]
-    passed = np.clip((free - was) / safe, 0.0, 1.0)
-    on_ramp = begin[..., 1] + passed * length[..., 1]
-    spread = LAG_DOUBT_S * np.linspace(-1.7, 1.7, len(POINTS))
-    ramp = np.maximum(on_ramp[..., None] + spread, 0.0)
-    anywhere = np.concatenate([onset[..., 0, :], onset[..., 1, :]], axis=-1)
-    within = ((free - was) / safe > -0.05) & ((free - was) / safe < 1.05)
-    ramp = np.where(within[..., None], ramp, anywhere[..., ::2])
-    found = np.stack([onset[..., 0, :], ramp], axis=2).reshape(len(was), -1, len(POINTS))
-    return found, np.full(found.shape, 1.0 / len(POINTS))
+    lag, scatter = np.hypot(*model.lag_deviations_s), float(model.scatter[motor])
+    share = np.full(len(POINTS), 1.0 / len(POINTS))
+
+    def of_row(run: int, row: int, amount: FloatArray) -> tuple[FloatArray, FloatArray]:
+        m, on_ramp = divmod(row, 2)
+        parts = begin[run, m, :, None] + POINTS * length[run, m, :, None]  # (part, sample)
+        if not on_ramp:
+            return parts[0], share
+        first, travel = was[run, m], goal[run, m] - was[run, m]
+        held, deviation = amount
+        passed = (held - first) / travel if abs(travel) > STILL_RAD else np.inf
+        if not -OFF_RAMP < passed < 1.0 + OFF_RAMP:
+            return parts.ravel()[::2], share
+        ramp = length[run, m, 1]
+        spread = np.hypot(ramp * np.hypot(deviation, scatter) / travel, lag)
+        middle = begin[run, m, 1] + np.clip(passed, 0.0, 1.0) * ramp
+        return np.maximum(middle + spread * NORMAL_QUANTILES, 0.0), share
+
+    return of_row

@@ -19,7 +19,7 @@ from failuretwin.core.compiled import compiled
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.engine.integral import Noise, invert, log_density
 from failuretwin.inference.engine.outcomes import Outcomes
-from failuretwin.inference.engine.rows import AmountPrior, Rows, Scene, before_onset, sampled
+from failuretwin.inference.engine.rows import AmountPrior, Onsets, Rows, Scene, before_onset
 from failuretwin.inference.engine.theta import Motion, columns
 
 Angle = Callable[[FloatArray, IntArray], FloatArray]
@@ -173,7 +173,7 @@ class MovedMotor:
         variance: FloatArray,
         log_prior: FloatArray,
         amount_prior: AmountPrior,
-        onsets: tuple[FloatArray, FloatArray],
+        onsets: Onsets,
     ) -> Rows:
         """Return the rows about some amounts.
 
@@ -182,7 +182,7 @@ class MovedMotor:
             variance: var(z), (run, row).
             log_prior: (run, row).
             amount_prior: Log density of the amount.
-            onsets: Samples of the onset and their shares, (run, row, sample) each.
+            onsets: Onset of a run and row.
         """
         scene, moments, motor = self.scene, self.scene.moments, self.motor
         base = np.repeat(moments.base[:, None], x.shape[1], axis=1)
@@ -217,7 +217,7 @@ class MovedMotor:
             x,
             variance,
             amount_prior,
-            onsets=sampled(*onsets),
+            onsets=onsets,
         )
         return before_onset(rows, scene.healthy, scene.columns)
 

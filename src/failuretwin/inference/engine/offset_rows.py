@@ -13,7 +13,7 @@ from failuretwin.digital_model.settling import sag
 from failuretwin.failure_behavior.fault import Arrival
 from failuretwin.failure_behavior.mode import FaultMode, Signature
 from failuretwin.inference.engine.moved_motor import ARRIVED, FREE_RAD, Angle, MovedMotor, taken
-from failuretwin.inference.engine.rows import AmountPrior, Rows, Scene
+from failuretwin.inference.engine.rows import AmountPrior, Rows, Scene, sampled
 from failuretwin.inference.faults.fault_sizes import SizePrior, coarse_sizes
 from failuretwin.inference.faults.priors import OnsetIntervals
 
@@ -56,7 +56,7 @@ def offset_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
     slope = np.sqrt(np.mean(moving.slope(x, ARRIVED) ** 2, axis=-1))
     deviation = np.minimum(FREE_RAD / np.maximum(slope, 1e-6), 0.5 * high)
     prior = _size_prior(sizes, mode.signed)
-    return moving.rows(x, deviation**2, log_prior, prior, (onsets, shares))
+    return moving.rows(x, deviation**2, log_prior, prior, sampled(onsets, shares))
 
 
 def moment_intervals(scene: Scene) -> OnsetIntervals:

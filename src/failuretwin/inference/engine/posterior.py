@@ -85,10 +85,12 @@ def _given_all(evidence: RunsEvidence, h: int, pick: int) -> FloatArray:
 
 
 def _onset(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> Weighted | None:
-    rows, picks = evidence.rows[h], evidence.weighed[h].picks
+    rows, one = evidence.rows[h], evidence.weighed[h]
     if rows.onsets is None:
         return None
-    parts = [rows.onsets(int(picks.run[i]), int(picks.row[i])) for i in some]
+    run, row = one.picks.run[some].tolist(), one.picks.row[some].tolist()
+    told = zip(run, row, one.amount[some], strict=True)
+    parts = [rows.onsets(*one) for one in told]
     weights = [
         p * part / max(part.sum(), 1e-300) for p, (_, part) in zip(share, parts, strict=True)
     ]
@@ -97,7 +99,7 @@ def _onset(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) ->
 
 def _size(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> Weighted | None:
     rows, one = evidence.rows[h], evidence.weighed[h]
-    if rows.size is not None:
+    if rows.drawn is not None:
         drawn = [_rms(evidence, h, int(i)) for i in some]
         mean, deviation = np.array(drawn).T
     elif rows.amount_prior is not None:
@@ -108,7 +110,7 @@ def _size(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> 
         return None
     values = mean[:, None] + deviation[:, None] * NORMAL_STEPS
     weights = share[:, None] * NORMAL_WEIGHTS
-    if rows.size is not None:  # the mean square is nearly normal, not its root
+    if rows.drawn is not None:  # the mean square is nearly normal, not its root
         values = np.sqrt(np.maximum(values, 0.0))
     return Weighted(values.ravel(), weights.ravel())
 
@@ -118,20 +120,66 @@ def _is_held(hypothesis: Hypothesis) -> bool:
 
 
 def _rms(evidence: RunsEvidence, h: int, pick: int) -> tuple[float, float]:
-    """Return mean and deviation of the mean square of sizes that movements draw anew."""
+    """Return mean and deviation of the mean square of sizes that movements draw anew.
+
+    Movements that are not seen have the size that is expected beforehand.
+    """
     rows, one = evidence.rows[h], evidence.weighed[h]
-    run, row = one.picks.run[pick], one.picks.row[pick]
-    assert rows.size is not None
-    size = rows.size[evidence.part(h, one.picks[pick : pick + 1]).kept[0]]
-    share = np.where(np.isfinite(size), one.found.share[pick], 0.0)
-    usable = evidence.scene.moments.usable[run]
-    counts = usable & (np.arange(len(share)) >= rows.first[row]) & (share.sum(axis=-1) > 0.0)
-    share = share[counts] / share[counts].sum(axis=-1, keepdims=True)
-    square = np.nan_to_num(size[counts]) ** 2
-    mean = np.sum(share * square, axis=-1)
-    variance = np.maximum(np.sum(share * square**2, axis=-1) - mean**2, 0.0)
-    count = max(int(counts.sum()), 1)
-    return float(mean.sum() / count), float(np.sqrt(variance.sum()) / count)
+    assert rows.drawn is not None
+    moments, run = evidence.scene.moments, int(one.picks.run[pick])
+    after = np.arange(moments.count) >= rows.first[one.picks.row[pick]]
+    share = np.where(one.found.share[pick].sum(axis=-1) > 0.0, moments.usable[run], False)
+    seen = np.flatnonzero(share & after)
+    start = moments.start[run]
+    exists = moments.ramp[run].any(axis=1)
+    hidden = exists & after & ~np.isin(start, start[seen])
+    unseen = len(np.unique(start[hidden]))
+    square, variance = _squares(evidence, h, pick, seen)
+    mean, spread = rows.drawn.square[one.picks.row[pick]]
+    count = max(len(seen) + unseen, 1)
+    return (
+        float((square.sum() + unseen * mean) / count),
+        float(np.sqrt(variance + unseen * spread) / count),
+    )
+
+
+def _squares(evidence: RunsEvidence, h: int, pick: int, seen: IntArray) -> tuple[FloatArray, float]:
+    """Return the mean squared size of some moments, (moment,), and the variance of their sum.
+
+    In the node s of width w with lever J, residual r and scale S, which holds w^2/12 J J^T,
+
+        x | node ~ N(s + k J^T S^-1 r, k - k^2 J^T S^-1 J),    k = w^2 / 12
+
+    and what theta leaves open is shared by the moments.
+    """
+    drawn, one = evidence.rows[h].drawn, evidence.weighed[h]
+    assert drawn is not None
+    picks, found = one.picks[pick : pick + 1], one.found.some(np.array([pick]))
+    part, run = evidence.part(h, picks), int(one.picks.run[pick])
+    middle, square, fourth = np.zeros((3, len(seen)))
+    across = np.zeros((len(seen), found.mean.shape[-1]))  # moves the size by what is off in f
+    for n, m in enumerate(seen.tolist()):
+        kept = part.kept[0, m]
+        node, width, lever = drawn.size[kept], drawn.width[kept], drawn.lever[run, m, kept]
+        residual, scale = (values[0] for values in part.outcomes_at(m))
+        pull = np.linalg.solve(scale, lever[..., None])[..., 0]
+        known = np.sum(pull * lever, axis=-1)
+        within = width**2 / 12.0
+        step = within * np.sum(pull * (residual - found.mean[0, m]), axis=-1)
+        size = node + np.clip(step, -0.5 * width, 0.5 * width)
+        left = np.maximum(within * (1.0 - within * known), 0.0)
+        share = np.where(np.isfinite(node), found.share[0, m], 0.0)
+        share, size = share / share.sum(), np.nan_to_num(size)
+        middle[n] = share @ size
+        square[n] = share @ (size**2 + left)
+        fourth[n] = share @ (size**4 + 6.0 * size**2 * left + 3.0 * left**2)
+        best = int(share.argmax())
+        across[n] = pull[best] / max(known[best], 1e-12)
+    _, theta = theta_given(part, *found.sites)
+    moved = np.einsum("mc,mct->mt", across, part.columns[0, seen])
+    shared = moved @ theta[0] @ moved.T
+    variance = np.sum(np.maximum(fourth - square**2, 0.0)) + 4.0 * middle @ shared @ middle
+    return square + np.diag(shared), float(variance)
 
 
 def _outcome_probability(evidence: RunsEvidence, h: int, pick: int) -> FloatArray:

@@ -17,7 +17,7 @@ from failuretwin.core.numerics import log_of
 from failuretwin.core.types import FloatArray
 from failuretwin.failure_behavior.mode import FaultMode
 from failuretwin.inference.engine.outcomes import Outcomes
-from failuretwin.inference.engine.rows import Rows, Scene, sampled
+from failuretwin.inference.engine.rows import Drawn, Rows, Scene, sampled
 from failuretwin.inference.faults.priors import OnsetIntervals
 
 NODES, DECADE = 16, 8
@@ -39,13 +39,14 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
     size, width = np.r_[-node[::-1], node], np.r_[width[::-1], width]
     mass = np.stack([_mass(edge, *ends) for ends in sizes.ranges])  # (range, node)
     shares = np.array(sizes.shares)
-    mean_square, fourth = (float(shares @ (mass @ size**k)) for k in (2, 4))
+    mass = np.concatenate([mass, shares[None] @ mass])  # and any range
+    squares, fourths = mass @ size**2, mass @ size**4
+    mean_square, fourth = float(squares[-1]), float(fourths[-1])
+    nodes = _nodes(scene, motor, size, width)
     outcomes = Outcomes.joined(
-        scene.healthy,
-        _nodes(scene, motor, size, width),
-        _beside_losses(scene, motor, mean_square, fourth),
+        scene.healthy, nodes, _beside_losses(scene, motor, mean_square, fourth)
     )
-    weight = _weights(scene, [*mass, shares @ mass])
+    weight = _weights(scene, mass)
     faulty, any_range = weight[:, :-1], weight[:, -1]
     count, usual = moments.count, moments.log_weight.shape[-1]
     sound = np.full_like(any_range, -np.inf)
@@ -70,7 +71,14 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
         np.zeros((runs, rows, count, moments.point.shape[-1])),
         nothing,
         nothing,
-        size=np.r_[np.full(usual, np.nan), size, np.full(usual - 1, np.sqrt(mean_square))],
+        drawn=Drawn(
+            np.r_[np.full(usual, np.nan), size, np.full(usual - 1, np.sqrt(mean_square))],
+            np.r_[np.zeros(usual), width, np.zeros(usual - 1)],
+            _levers(size, nodes.residual, usual),
+            np.stack([squares, fourths - squares**2], axis=1)[
+                np.minimum(np.arange(rows), len(shares))
+            ],
+        ),
         onsets=sampled(samples[:, first], share[:, first]),
     )
 
@@ -95,6 +103,23 @@ def _nodes(scene: Scene, motor: int, size: FloatArray, width: FloatArray) -> Out
     return Outcomes.of_poses(moments, model.sensors.expected(pose), model.scatter**2, late, beside)
 
 
+def _levers(size: FloatArray, residual: FloatArray, usual: int) -> FloatArray:
+    """Return what the sensors show of a size, (run, moment, outcome, channel) [m per unit].
+
+    Args:
+        size: Of each node, (node,).
+        residual: What was seen less what each node shows, (run, moment, node, channel) [m].
+        usual: Number of outcomes of the healthy robot.
+    """
+    half = len(size) // 2
+    sides = (slice(0, half), slice(half, None))
+    slopes = [-np.gradient(residual[:, :, side], size[side], axis=2) for side in sides]
+    before, after = (
+        np.zeros_like(residual[:, :, :1]).repeat(n, axis=2) for n in (usual, usual - 1)
+    )
+    return np.concatenate([before, *slopes, after], axis=2)
+
+
 def _beside_losses(scene: Scene, motor: int, mean_square: float, fourth: float) -> Outcomes:
     """Return the outcomes in which commands get lost, with an error x of moments E x^2 and E x^4.
 
@@ -116,7 +141,7 @@ def _beside_losses(scene: Scene, motor: int, mean_square: float, fourth: float) 
     return replace(found, residual=found.residual - bend, beside=found.beside + spread)
 
 
-def _weights(scene: Scene, masses: list[FloatArray]) -> FloatArray:
+def _weights(scene: Scene, masses: FloatArray) -> FloatArray:
     """Return the log weight of each outcome, (run, row, moment, outcome)."""
     usual = scene.moments.log_weight
     never = np.full_like(usual, -np.inf)

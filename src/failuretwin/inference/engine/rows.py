@@ -23,8 +23,26 @@ from failuretwin.inference.observation.healthy_model import HealthyModel
 
 AmountPrior = Callable[[FloatArray, IntArray, IntArray], FloatArray]
 """Log density of amounts (pick, node) of some runs (pick,) and rows (pick,), same axes."""
-Onsets = Callable[[int, int], tuple[FloatArray, FloatArray]]
-"""Samples of the onset of a run and row [s], and their shares, (sample,) each."""
+Onsets = Callable[[int, int, FloatArray], tuple[FloatArray, FloatArray]]
+"""Samples of the onset of a run and row [s], and their shares, (sample,) each, given mean and
+deviation of its amount, (2,)."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Sizes that every movement draws anew.
+
+    Attributes:
+        size: Middle of the node of each outcome, (outcome,); NaN: the outcome has no size.
+        width: Width of the node, (outcome,); 0: it is counted as one size.
+        lever: What the sensors show of a size, (run, moment, outcome, channel) [m per unit].
+        square: Mean and variance of the square of a size that is not seen, (row, 2).
+    """
+
+    size: FloatArray
+    width: FloatArray
+    lever: FloatArray
+    square: FloatArray
 
 
 @dataclass(frozen=True)
@@ -42,7 +60,7 @@ class Rows:
         centre: Amount at z = 0, (run, row).
         variance: var(z) before its prior is put in, (run, row); 0 without an amount.
         amount_prior: Log density of the amount; None: the normal one stands.
-        size: Size of each outcome where every movement draws its own, (outcome,); NaN: none.
+        drawn: Sizes of outcomes where every movement draws its own; None: it does not.
         onsets: Onset of a run and row; None: no fault.
     """
 
@@ -56,7 +74,7 @@ class Rows:
     centre: FloatArray
     variance: FloatArray
     amount_prior: AmountPrior | None = None
-    size: FloatArray | None = None
+    drawn: Drawn | None = None
     onsets: Onsets | None = None
 
 
@@ -139,13 +157,13 @@ class Scene:
 
 
 def sampled(onset: FloatArray, share: FloatArray) -> Onsets:
-    """Return the onsets of rows that each have samples of their own.
+    """Return the onsets of rows that each have samples of their own, whatever their amount.
 
     Args:
         onset: (run, row, sample) [s].
         share: Share of each, same axes.
     """
-    return lambda run, row: (onset[run, row], share[run, row])
+    return lambda run, row, _: (onset[run, row], share[run, row])
 
 
 def before_onset(rows: Rows, healthy: Outcomes, columns_of: FloatArray) -> Rows:

@@ -184,14 +184,30 @@ class Weighing:
 
     def weights(self) -> list[MarginalLikelihood]:
         """Return what the runs say of each hypothesis, with onset and size."""
-        total, found = self.by_hypothesis, dict[int, MarginalLikelihood]()
-        if self.likelihood.moving is None:
-            says = engine_likelihoods(self.evidence)
-            found = dict(zip(self.with_rows.tolist(), says, strict=True))
+        total = self.by_hypothesis
+        says = engine_likelihoods(self.evidence)
+        found = dict(zip(self.with_rows.tolist(), says, strict=True))
         return [
-            replace(found.get(h) or self._whole_at_best[h], log_evidence=total[:, h])
+            replace(self._with_way(h, found.get(h)), log_evidence=total[:, h])
             for h in range(len(self.hypotheses))
         ]
+
+    def _with_way(self, h: int, settled: MarginalLikelihood | None) -> MarginalLikelihood:
+        """Return what runs say of a hypothesis, those on whose way it counts by all readings."""
+        way = self.likelihood.moving
+        if way is None and settled is not None:
+            return settled
+        whole = self._whole_at_best[h]
+        if way is None or settled is None:
+            return whole
+        counts: BoolArray = np.any(way.seen, axis=(1, 2))
+        said = [whole if own else settled for own in counts.tolist()]
+        return MarginalLikelihood(
+            whole.log_evidence,
+            lambda run: said[run].by_movement(run),
+            lambda run: said[run].settled(run),
+            lambda run: said[run].estimate(run),
+        )
 
     def posterior(self) -> Posterior:
         """Return the posterior over hypotheses."""
