@@ -262,6 +262,7 @@ class _Reported:
     at_s: float = -math.inf
     states: dict[str, tuple[str, str]] = field(default_factory=dict)
     behind: bool = False
+    remarks: frozenset[str] = frozenset()
 
 
 class _Holder:
@@ -441,18 +442,21 @@ class _Holder:
     async def _report(self) -> None:
         """Publish health and lag now and then; robots whose state changes by themselves."""
         now_s, before = time.monotonic(), self._reported
-        if now_s - before.at_s < HEALTH_S:
+        if now_s - before.at_s < HEALTH_S or not self._source.heard_to_s:
             return
-        robots = self._partition.health()
+        robots, remarks = self._partition.health(), dict(self._partition.remarks)
         for table in robots.values():
-            if self._source.heard_to_s - table["heard"] > SILENCE_S and self._source.pending == 0:
+            if self._source.heard_to_s - table["heard"] > SILENCE_S:
                 table["state"] = STALE
+        for name in remarks.keys() - before.remarks:
+            self._worker.outlets.tell(f"{name}: message left out: {remarks[name]}")
         rate = self._taken / (now_s - before.at_s) if math.isfinite(before.at_s) else 0.0
         report = {
             "worker": self._worker.settings.name,
             "at": time.time(),
             "robots": robots,
             "counts": dict(self._partition.counts),
+            "remarks": remarks,
             "pending": self._source.pending,
             "lag_s": round(self._lag_s, 3),
             "messages_per_s": round(rate, 1),
@@ -467,7 +471,7 @@ class _Holder:
             waiting = f"{self._source.pending} messages, {self._lag_s:.0f} s behind"
             said = f"cannot follow: {waiting}; nothing is lost" if behind else "follows again"
             self._worker.outlets.tell(f"partition {self.number}: {said}")
-        self._reported = _Reported(now_s, states, behind)
+        self._reported = _Reported(now_s, states, behind, frozenset(remarks))
         self._worker.outlets.metrics.report(self.key, report)
         await self._publish_health(report, changed)
 
