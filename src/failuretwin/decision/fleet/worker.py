@@ -341,11 +341,12 @@ class _Holder:
         self._partition = Partition(worker.resolve, budget, await self._announced(), last)
 
     async def _announced(self) -> dict[str, ProfileMessage]:
-        """Return the profiles that are known of all robots."""
-        found = {}
+        """Return the profiles that are known of the robots of this partition."""
+        found, of = {}, self._worker.settings.partitions
         for name, entry in (await entries(self._worker.buckets.profiles)).items():
-            with suppress(InputError):
-                found[name] = parse_profile(entry.value or b"")
+            if names.partition_of(name, of) == self.number:
+                with suppress(InputError):
+                    found[name] = parse_profile(entry.value or b"")
         return found
 
     async def _step(self) -> bool:
