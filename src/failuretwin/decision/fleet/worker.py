@@ -169,6 +169,7 @@ class Worker:
         from nats.js.errors import KeyWrongLastSequenceError
 
         for holder in list(self._held.values()):
+            asked_s = time.monotonic()
             try:
                 holder.lease = await self.buckets.leases.update(
                     holder.key, self.settings.name.encode(), last=holder.lease
@@ -176,6 +177,7 @@ class Worker:
             except KeyWrongLastSequenceError:
                 await self._drop(holder, "another worker has it")
                 continue
+            holder.renewed_s = asked_s
             if holder.task.done():
                 await self._drop(holder, "its work failed")
 
@@ -270,6 +272,7 @@ class _Holder:
 
     def __init__(self, worker: Worker, number: int, lease: int) -> None:
         self.number, self.key, self.lease = number, f"p{number}", lease
+        self.renewed_s = time.monotonic()
         self._worker = worker
         self._stop = asyncio.Event()
         self._source = MessageSource(worker.broker.stream, number)
@@ -444,6 +447,8 @@ class _Holder:
         """Publish health and lag now and then; robots whose state changes by themselves."""
         now_s, before = time.monotonic(), self._reported
         if now_s - before.at_s < HEALTH_S or not self._source.heard_to_s:
+            return
+        if now_s - self.renewed_s > UNCHANGED * RENEW_S:  # paused or cut off: may be another's
             return
         robots, remarks = self._partition.health(), dict(self._partition.remarks)
         for table in robots.values():
