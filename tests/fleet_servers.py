@@ -45,17 +45,17 @@ def wait_for(port, process):
 
 
 class NatsServer:
-    """A server with JetStream and MQTT; `extra` is added to its configuration."""
+    """A server with JetStream and MQTT; `extra` is added to the configuration of `config`."""
 
-    def __init__(self, folder, extra="", partitions=2):
+    def __init__(self, folder, extra="", partitions=2, config=server_config):
         self._program = need_program("nats-server")
         pytest.importorskip(
             "nats", reason="nats-py is not installed: pip install 'failuretwin[fleet]'"
         )
         self.folder, self.port, self.mqtt_port = folder, free_port(), free_port()
         folder.mkdir(parents=True, exist_ok=True)
-        config = server_config(self.port, self.mqtt_port, folder / "data", partitions)
-        (folder / "nats.conf").write_text(config + extra)
+        text = config(self.port, self.mqtt_port, folder / "data", partitions)
+        (folder / "nats.conf").write_text(text + extra)
         self.process = None
         self.start()
 

@@ -29,12 +29,11 @@ def bridge_one(
     async def main(stop: asyncio.Event) -> None:
         with ExitStack() as stack:
             link, _ = connect(source, robot.model, live, robot.seed, stack)
-            broker = await open_broker(access, f"bridge-{name}")
-            publisher = Publisher(broker, tell, stop, len(robot.model.motors))
-            await publisher.announce([name], profile)
-            tell(f"{name}: {link.name} to {access.shown}; stop with Ctrl-C")
-            await bridge_source(link, name, publisher, stop)
-            await broker.close()
+            async with await open_broker(access, f"bridge-{name}") as broker:
+                publisher = Publisher(broker, tell, stop, len(robot.model.motors))
+                await publisher.announce([name], profile)
+                tell(f"{name}: {link.name} to {access.shown}; stop with Ctrl-C")
+                await bridge_source(link, name, publisher, stop)
             tell(f"{counted(publisher.sent, 'message')} sent, {link.counts.dropped} events dropped")
 
     run_until_stopped(main)
@@ -57,13 +56,12 @@ def bridge_emulated(
     ]
 
     async def main(stop: asyncio.Event) -> None:
-        broker = await open_broker(access, f"bridge-{name}")
-        publisher = Publisher(broker, tell, stop, len(robot.model.motors))
-        fleet = EmulatedFleet(arms, time.time(), live.seconds or math.inf)
-        await publisher.announce(fleet.names, profile)
-        tell(f"{counted(robots, 'emulated robot')} to {access.shown}; stop with Ctrl-C")
-        await bridge_fleet(fleet.second, publisher, stop, live.speed)
-        await broker.close()
+        async with await open_broker(access, f"bridge-{name}") as broker:
+            publisher = Publisher(broker, tell, stop, len(robot.model.motors))
+            fleet = EmulatedFleet(arms, time.time(), live.seconds or math.inf)
+            await publisher.announce(fleet.names, profile)
+            tell(f"{counted(robots, 'emulated robot')} to {access.shown}; stop with Ctrl-C")
+            await bridge_fleet(fleet.second, publisher, stop, live.speed)
         tell(f"{counted(publisher.sent, 'message')} sent")
 
     run_until_stopped(main)

@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 
@@ -60,13 +60,19 @@ def resolver(folder: Path | None) -> Resolve:
         elif message.profile in bundled_robots():
             robot = load_robot(message.profile)
         else:
-            raise InputError(f"unknown profile {message.profile!r}. Add it to --profiles.")
+            raise InputError(
+                f"unknown profile {message.profile!r}, expected a bundled one, or "
+                f"{message.profile}.toml in the folder of worker --profiles."
+            )
         known = load_calibration(None, robot)
         if message.calibration:
             try:
                 table = tomllib.loads(message.calibration)
             except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
-                raise InputError(f"calibration in a profile: {error}.") from error
+                raise InputError(
+                    f"calibration in a profile: {error}. Expected the text of a file that "
+                    "`calibrate` wrote."
+                ) from error
             known = calibration_from_table(table, robot, "calibration in a profile")
         return BayesDiagnoser(known.twin, known.imperfections, whole_run=False)
 
@@ -96,8 +102,8 @@ async def read_status(broker: Broker) -> dict[str, Any]:
             found[key][one] = value.decode() if key == "leases" else json.loads(value)
     for key, stream in (("waiting", names.EVENTS_STREAM), ("alarms", names.ALARM_STREAM)):
         try:
-            found[key] = (await broker.stream.stream_info(stream)).state.messages
-        except Error:
+            found[key] = await broker.messages(stream)
+        except (Error, TimeoutError):
             found[key] = None
     return found
 
@@ -118,18 +124,24 @@ def status_page(status: dict[str, Any], now: float) -> Group:
     needy.sort(key=lambda name: (LOOK.index(robots[name]["state"]), name))
     for name in needy[:SHOWN]:
         looks.add_row(name, robots[name]["state"], printable(robots[name]["cause"]))
-    counts: Counter[str] = Counter()
-    for part in status["partitions"].values():
-        counts += left_out(part)
-    words = ", ".join(f"{count} {reason}" for reason, count in counts.most_common())
     more = f"and {len(needy) - SHOWN} more" if len(needy) > SHOWN else ""
-    lines = [
+    kept = (
         f"{counted(len(robots), 'robot')}, {status['alarms'] or 0} alarms and ends of alarms kept, "
-        f"{status['waiting'] or 0} messages no snapshot covers yet",
-        f"left out so far: {words or 'nothing'}",
-        more,
-    ]
-    return Group(*lines[:1], health, looks, *lines[2:], lines[1], _workers(status, now))
+        f"{status['waiting'] or 0} messages no snapshot covers yet"
+    )
+    return Group(kept, health, looks, more, *_left_out(status), _workers(status, now))
+
+
+def _left_out(status: dict[str, Any]) -> list[RenderableType]:
+    """Return what was left out by reason, and of some robots why."""
+    parts = status["partitions"].values()
+    counts: Counter[str] = sum(map(left_out, parts), Counter())
+    words = ", ".join(f"{count} {reason}" for reason, count in counts.most_common())
+    remarks = sorted(one for part in parts for one in part.get("remarks", {}).items())
+    table = _table("robot", "last message left out")
+    for name, text in remarks[:SHOWN]:
+        table.add_row(name, printable(text))
+    return [f"left out so far: {words or 'nothing'}", *([table] if remarks else [])]
 
 
 LOOK = ("alarm", "undecided", "stale", "suspected")
@@ -143,7 +155,7 @@ def _workers(status: dict[str, Any], now: float) -> Table:
         held.setdefault(name, []).append(key)
     for name, keys in sorted(held.items()):
         parts = [status["partitions"][key] for key in keys if key in status["partitions"]]
-        last = max((part["at"] for part in parts), default=now)
+        at = status["workers"].get(name, {}).get("at")
         table.add_row(
             name,
             ", ".join(sorted(keys)),
@@ -151,7 +163,7 @@ def _workers(status: dict[str, Any], now: float) -> Table:
             f"{sum(part['messages_per_s'] for part in parts):.0f}",
             f"{max((part['lag_s'] for part in parts), default=0.0):.1f}",
             str(sum(part["pending"] for part in parts)),
-            f"{now - last:.0f} s ago",
+            "no longer" if at is None else f"{now - at:.0f} s ago",
         )
     free = sorted(set(status["partitions"]) - set(status["leases"]))
     if free:
@@ -170,14 +182,13 @@ def show_status(access: Access, console: Console, watch: bool) -> None:
     """Print the status of a fleet once, or again and again until stopped."""
 
     async def main(stop: asyncio.Event) -> None:
-        broker = await open_broker(access, "status")
-        if not watch:
-            console.print(status_page(await read_status(broker), time.time()))
-        else:
+        async with await open_broker(access, "status") as broker:
+            if not watch:
+                console.print(status_page(await read_status(broker), time.time()))
+                return
             with Live(console=console, auto_refresh=False) as live:
                 while not stop.is_set():
                     live.update(status_page(await read_status(broker), time.time()), refresh=True)
                     await asyncio.sleep(REFRESH_S)
-        await broker.close()
 
     run_until_stopped(main)

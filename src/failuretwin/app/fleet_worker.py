@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AsyncExitStack, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,19 +47,20 @@ def work(
     records = ft.open_store(store) if store else None
 
     async def main(stop: asyncio.Event) -> None:
-        broker = await open_broker(access, settings.name)
-        with Retained(mqtt, settings.name, tell, access.ca) as retained:
+        async with AsyncExitStack() as stack:
+            broker = await stack.enter_async_context(await open_broker(access, settings.name))
+            retained = stack.enter_context(Retained(mqtt, settings.name, tell, access.ca))
             outlets = Outlets(tell, figures, retained.publish if mqtt else None)
             worker = Worker(broker, settings, resolver(profiles), outlets)
             tell(f"worker {settings.name} at {access.shown}; stop with Ctrl-C")
             await broker.set_up()
+            await broker.check_mapping(settings.partitions)
             writer = None
             if records is not None:
                 writer = asyncio.create_task(write_alarms(broker, records, stop, tell))
             await worker.run(stop)
             if writer is not None:
                 await writer
-        await broker.close()
 
     run_until_stopped(main)
 

@@ -104,7 +104,7 @@ def _cell(value: Any) -> str:
     if isinstance(value, datetime):
         return _time(value)
     if isinstance(value, float):
-        return f"{value:.1f}"
+        return f"{value:.1f}" if abs(value) >= 1.0 else f"{value:.2g}"
     return "" if value is None else str(value)
 
 

@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from failuretwin.app.cli import cli
-from failuretwin.connection.fleet.broker import IN, Access, open_broker
+from failuretwin.connection.fleet.broker import IN, Access, open_broker, server_config
 from failuretwin.connection.fleet.messages import (
     events_binary,
     profile_json,
@@ -296,3 +296,39 @@ def test_a_server_that_is_not_there_is_one_error():
     for words in (["worker", "nats://127.0.0.1:1"], ["fleet", "status", "--fleet", "http://x"]):
         with pytest.raises(InputError, match="fleet server"):
             CliRunner().invoke(cli, words, catch_exceptions=False, standalone_mode=False)
+
+
+def plain(port, *_):
+    """Return the configuration of a server as the package of Debian starts it."""
+    return f"host: 127.0.0.1\nport: {port}\n"
+
+
+def unmapped(port, mqtt_port, folder, partitions):
+    """Return the configuration of a server that keeps streams, but maps no robots."""
+    return f'{plain(port)}jetstream {{ store_dir: "{folder}" }}\n'
+
+
+@pytest.mark.parametrize(
+    ("config", "partitions", "said"),
+    [
+        (plain, 2, "no JetStream.*fleet config"),
+        (unmapped, 2, "over no partitions. Expected 2.*mappings"),
+        (server_config, 3, "another number of partitions. Expected 3.*--partitions"),
+    ],
+)
+def test_a_server_that_cannot_carry_a_fleet_is_refused(tmp_path, config, partitions, said):
+    server = NatsServer(tmp_path / "server", config=config)
+    try:
+        with pytest.raises(InputError, match=said):
+            words = ["worker", server.url, "--partitions", str(partitions)]
+            CliRunner().invoke(cli, words, catch_exceptions=False, standalone_mode=False)
+    finally:
+        server.close()
+
+
+@pytest.mark.parametrize("option", ["--nkey", "--tls-ca", "--tls-cert"])
+def test_a_file_of_access_that_is_none_is_named(tmp_path, option):
+    (tmp_path / "file").write_text("not what is expected")
+    words = ["fleet", "status", "--fleet", "tls://127.0.0.1:1", option, str(tmp_path / "file")]
+    with pytest.raises(InputError, match=rf"{option} .*file: .* Expected .*"):
+        CliRunner().invoke(cli, words, catch_exceptions=False, standalone_mode=False)

@@ -117,9 +117,14 @@ def test_a_robot_without_a_profile_is_counted_until_it_has_one():
     partition = Partition(resolve)
     partition.take([Envelope(1, ZERO_S, "stranger", EVENTS, message)])
     assert partition.counts == {"no_profile": 1}
-    partition.take([Envelope(2, ZERO_S, "stranger", PROFILE, profile_json(PROFILE_OF))])
+    assert "fleet.in.ROBOT.profile" in partition.remarks["stranger"]
+    partition.take([Envelope(2, ZERO_S, "stranger", PROFILE, b'{"profile": "armpi_fpw"}')])
     partition.take([Envelope(3, ZERO_S, "stranger", EVENTS, message)])
-    assert partition.counts == {"no_profile": 1}
+    assert partition.counts == {"no_profile": 2, "malformed": 1}
+    assert "armpi_fpw" in partition.remarks["stranger"]
+    partition.take([Envelope(4, ZERO_S, "stranger", PROFILE, profile_json(PROFILE_OF))])
+    partition.take([Envelope(5, ZERO_S, "stranger", EVENTS, message)])
+    assert partition.counts == {"no_profile": 2, "malformed": 1} and not partition.remarks
     assert partition.health()["stranger"]["state"] == "waiting"
 
 

@@ -87,8 +87,7 @@ class Publisher:
             except (Error, OSError, TimeoutError) as error:
                 if not self._waits:
                     self._waits = True
-                    why = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-                    self._tell(f"the server takes no messages ({why}); waiting")
+                    self._tell(f"the server takes no messages ({_reason(error)}); waiting")
                 await asyncio.sleep(RETRY_S)
                 continue
             self.sent += 1
@@ -96,6 +95,14 @@ class Publisher:
                 self._waits = False
                 self._tell("the server takes messages again")
             return
+
+
+def _reason(error: Exception) -> str:
+    from nats.js.errors import NoStreamResponseError
+
+    if isinstance(error, NoStreamResponseError):
+        return "no stream keeps them; start one: failuretwin worker"
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
 async def bridge_source(

@@ -17,10 +17,12 @@ from __future__ import annotations
 
 import asyncio
 import ssl
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import urlsplit
 
 from failuretwin.core.errors import InputError, needs_extra
@@ -53,6 +55,8 @@ ANSWER_S = 5.0
 """Longest wait for the entries of a bucket [s]."""
 TRIES_S = 2.0
 """Time between two tries to reach a server that is gone [s]."""
+PROBES, PROBED_S = 16, 2.0
+"""Robots whose partitions are probed, and the longest wait for one of them [s]."""
 GOODBYE_S = 1.0
 """Longest wait for the end of a connection that was refused [s]."""
 
@@ -91,13 +95,35 @@ class Access:
         """TLS settings; None: not encrypted."""
         if urlsplit(self.url).scheme != "tls" and self.ca is None:
             return None
-        try:
+        with _read("--tls-ca", self.ca, "certificates (PEM)"):
             found = ssl.create_default_context(cafile=self.ca)
-            if self.certificate is not None:
+        if self.certificate is not None:
+            with _read("--tls-cert", self.certificate, "a certificate and its key (PEM)"):
                 found.load_cert_chain(self.certificate)
-        except (OSError, ssl.SSLError) as error:
-            raise InputError(f"TLS files of the fleet cannot be read: {error}.") from error
         return found
+
+    @property
+    def seed(self) -> str | None:
+        """Seed of the NKey; None: there is none."""
+        if self.nkey is None:
+            return None
+        with needs_extra("an NKey needs nkeys", "fleet"):
+            from nkeys import NkeysError, from_seed
+        with _read("--nkey", self.nkey, "the seed of a user (SU...)", NkeysError):
+            found = self.nkey.read_text().strip()
+            from_seed(found.encode())
+        return found
+
+
+@contextmanager
+def _read(
+    option: str, path: Path | None, expected: str, refusal: type[Exception] = ValueError
+) -> Iterator[None]:
+    """Say which file of an option cannot be read, and what it should hold."""
+    try:
+        yield
+    except (OSError, refusal) as error:
+        raise InputError(f"{option} {path}: {error}. Expected {expected}.") from error
 
 
 class Broker:
@@ -152,12 +178,51 @@ class Broker:
             await self._make(wanted)
 
     async def _make(self, wanted: Any) -> None:
-        from nats.js.errors import NotFoundError
+        if await self.messages(wanted.name) is None:
+            await self.stream.add_stream(wanted)
+
+    async def messages(self, stream: str) -> int | None:
+        """Return the number of messages in a stream; None: nobody has made it yet.
+
+        Raises:
+            InputError: If the server has no JetStream.
+        """
+        from nats.js.errors import NotFoundError, ServiceUnavailableError
 
         try:
-            await self.stream.stream_info(wanted.name)
+            return (await self.stream.stream_info(stream)).state.messages
         except NotFoundError:
-            await self.stream.add_stream(wanted)
+            return None
+        except ServiceUnavailableError as error:
+            raise InputError(
+                "the fleet server has no JetStream. Expected one that was started with the "
+                "configuration of `failuretwin fleet config`: nats-server -c nats.conf."
+            ) from error
+
+    async def check_mapping(self, partitions: int) -> None:
+        """Check that the server spreads robots over so many partitions; no probe is stored.
+
+        Raises:
+            InputError: If it does not.
+        """
+        robots = {f"probe_{number}" for number in range(PROBES)}
+        seen = await self.client.subscribe(f"{BY_PARTITION}.*.*.probe")
+        for robot in robots:
+            header = {"Nats-Expected-Stream": "none"}
+            await self.client.publish(f"{IN}.{robot}.probe", headers=header)
+        found = set[tuple[str, int]]()
+        with suppress(TimeoutError):
+            while len(found) < PROBES:
+                number, robot = (await seen.next_msg(timeout=PROBED_S)).subject.split(".")[2:4]
+                found.add((robot, int(number)))
+        await seen.unsubscribe()
+        if found != {(robot, partition_of(robot, partitions)) for robot in robots}:
+            got = "another number of partitions" if found else "no partitions"
+            raise InputError(
+                f"the fleet server spreads robots over {got}. Expected {partitions}: its "
+                f"configuration needs mappings = {{ {mapping(partitions)} }}, and each worker the "
+                "same number by --partitions."
+            )
 
     async def close(self) -> None:
         """Send what waits, then leave."""
@@ -167,6 +232,19 @@ class Broker:
             await self.client.flush(timeout=2)
         with suppress(Error, OSError, TimeoutError):  # the server is gone
             await self.client.close()
+
+    async def __aenter__(self) -> Self:
+        """Return the broker, which is closed at the end of the block."""
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the connection."""
+        await self.close()
 
     async def publish_once(self, subject: str, data: bytes) -> bool:
         """Store a message unless its subject has one, and return whether it is new."""
@@ -211,7 +289,7 @@ async def open_broker(access: Access, name: str) -> Broker:
         from nats.errors import Error
     options: dict[str, Any] = {}
     if access.nkey is not None:
-        options["nkeys_seed"] = str(access.nkey)
+        options["nkeys_seed_str"] = access.seed
     if access.context is not None:
         options["tls"] = access.context
     seen: list[Exception] = []
@@ -233,10 +311,9 @@ async def open_broker(access: Access, name: str) -> Broker:
     except (Error, OSError, TimeoutError) as error:
         with suppress(TimeoutError):  # nats-py waits for ever where TLS has failed
             await asyncio.wait_for(client.close(), GOODBYE_S)
-        raise InputError(
-            f"fleet server {access.shown}: {seen[-1] if seen else error}. Expected a NATS server "
-            "with JetStream that lets us in; see docs/fleet.md."
-        ) from error
+        got = str(seen[-1] if seen else error)
+        fix = next((fix for sign, fix in FIXES.items() if sign in got), FIX)
+        raise InputError(f"fleet server {access.shown}: {got}. {fix}") from error
     # It has let us in once: from now on it is waited for.
     client.options |= {
         "allow_reconnect": True,
@@ -244,6 +321,14 @@ async def open_broker(access: Access, name: str) -> Broker:
         "reconnect_time_wait": TRIES_S,
     }
     return Broker(client)
+
+
+FIX = "Expected a NATS server with JetStream that lets us in; see docs/fleet.md."
+FIXES = {
+    "CERTIFICATE_VERIFY_FAILED": "Expected a certificate of an authority that is known: --tls-ca.",
+    "Authorization Violation": "Expected a user and password that it knows in the URL, or --nkey.",
+}
+"""What to do where the server refuses us, by a part of its reason."""
 
 
 def server_config(port: int, mqtt_port: int, folder: Path, partitions: int = PARTITIONS) -> str:
@@ -256,6 +341,14 @@ jetstream {{ store_dir: "{folder}" }}
 mqtt {{ host: 127.0.0.1, port: {mqtt_port} }}
 mappings = {{ {mapping(partitions)} }}
 """
+
+
+def partition_of(robot: str, partitions: int) -> int:
+    """Return the partition of a robot, as the server computes it: FNV-1a of its name, modulo."""
+    found = 0x811C9DC5
+    for byte in robot.encode():
+        found = ((found ^ byte) * 0x01000193) & 0xFFFFFFFF
+    return found % partitions
 
 
 def mapping(partitions: int = PARTITIONS) -> str:

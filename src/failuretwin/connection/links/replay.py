@@ -110,9 +110,11 @@ def replay(path: Path, robot: Robot, pace: Pace, topics: BagTopics | None = None
         return PacedSource(path.name, log_events(read_bag(path, robot, topics), robot), pace)
     folders = find_sessions(path) if path.is_dir() else []
     if len(folders) != 1:
+        found = f"holds {len(folders)} raw sessions" if folders else "is neither"
+        fix = "Name one of them." if folders else "Run sets and tables are for `diagnose`."
         raise InputError(
-            f"{path}: expected one raw session or a bag (.bag, .mcap, a folder of ROS 2), found "
-            f"{len(folders)} sessions. Name one of them."
+            f"{path}: expected one raw session or a bag (.bag, .mcap, a folder of ROS 2), but it "
+            f"{found}. {fix}"
         )
     session = read_session(folders[0], robot)
     return PacedSource(session.name, session_events(session, robot), pace)

@@ -38,6 +38,9 @@ CLEARED = "cleared"
 MALFORMED, UNKNOWN, REFUSED = "malformed", "no_profile", "refused"
 """What is counted: messages that make no sense, those of robots without a profile, and those of
 robots that are refused."""
+NO_PROFILE = "no profile is known of it, expected one on fleet.in.ROBOT.profile first."
+MOST_REMARKS = 20
+"""Robots of a partition of which the reason is kept."""
 
 Resolve = Callable[[ProfileMessage], BayesDiagnoser]
 """Returns the method for robots with a profile; raises InputError where there is none."""
@@ -173,6 +176,7 @@ class Partition:
         last: Number of the last message that was taken; 0: none.
         announced: Profiles, by robot.
         refused: Robots whose messages break the filter: they are counted and left out.
+        remarks: Why a message was left out, the last one of a robot; of the first robots alone.
 
     Args:
         resolve: Finds the method for a profile.
@@ -192,6 +196,7 @@ class Partition:
         self.last = last
         self.announced = dict(announced or {})
         self.refused: set[str] = set()
+        self.remarks: dict[str, str] = {}
         self._resolve, self._budget = resolve, budget
         self._robots: dict[str, _Robot] = {}
         self._groups: dict[str, _Group] = {}
@@ -212,9 +217,10 @@ class Partition:
                 elif message.kind == EVENTS:
                     self._hear(message)
                 else:
-                    raise InputError(f"a message of kind {message.kind!r}.")
-            except InputError:
+                    raise InputError(f"kind {message.kind!r}, expected {PROFILE} or {EVENTS}.")
+            except InputError as error:
                 self.counts[MALFORMED] += 1
+                self._remark(message.robot, str(error))
         changes = list[AlarmChange]()
         for group in self._groups.values():
             for judged in group.judgements():
@@ -222,11 +228,16 @@ class Partition:
                     changes += self._changes(self._robots[message.robot], row, message)
         return changes
 
+    def _remark(self, robot: str, text: str) -> None:
+        if robot in self.remarks or len(self.remarks) < MOST_REMARKS:
+            self.remarks[robot] = text
+
     def _announce(self, message: Envelope) -> None:
         """Take in a profile; the same once more changes nothing."""
         found = parse_profile(message.data)
         self._resolve(found)
         self.announced[message.robot] = found
+        self.remarks.pop(message.robot, None)
         known = self._robots.get(message.robot)
         if known is not None and known.kind != fingerprint(found):
             self._flush_leaver(known)
@@ -243,6 +254,7 @@ class Partition:
         if robot is None:
             if message.robot not in self.announced:
                 self.counts[UNKNOWN] += 1
+                self._remark(message.robot, self.remarks.get(message.robot, NO_PROFILE))
                 return
             robot = self._join(message)
         group = self._groups[robot.kind]

@@ -27,7 +27,8 @@ class MessageSource:
     Attributes:
         subject: Their subjects.
         pending: Messages that waited in the server when it was last asked.
-        heard_to_s: Time by the clock of the server when it was last asked [s since 1970].
+        heard_to_s: Time up to which all messages are known, by the clock of the server
+            [s since 1970]; 0: it has not answered yet.
     """
 
     def __init__(self, stream: JetStreamContext, number: int) -> None:
@@ -57,7 +58,8 @@ class MessageSource:
             await self.close()
             return []
         found = self._envelopes(messages)
-        self.heard_to_s = self.server_now()
+        if found:
+            self.heard_to_s = self.server_now() if self.pending == 0 else found[-1].server_s
         if len(found) < len(messages):  # some were lost on the way: ask for them again
             await self.close()
         return found

@@ -169,6 +169,7 @@ class Worker:
         from nats.js.errors import KeyWrongLastSequenceError
 
         for holder in list(self._held.values()):
+            asked_s = time.monotonic()
             try:
                 holder.lease = await self.buckets.leases.update(
                     holder.key, self.settings.name.encode(), last=holder.lease
@@ -176,6 +177,7 @@ class Worker:
             except KeyWrongLastSequenceError:
                 await self._drop(holder, "another worker has it")
                 continue
+            holder.renewed_s = asked_s
             if holder.task.done():
                 await self._drop(holder, "its work failed")
 
@@ -262,6 +264,7 @@ class _Reported:
     at_s: float = -math.inf
     states: dict[str, tuple[str, str]] = field(default_factory=dict)
     behind: bool = False
+    remarks: frozenset[str] = frozenset()
 
 
 class _Holder:
@@ -269,6 +272,7 @@ class _Holder:
 
     def __init__(self, worker: Worker, number: int, lease: int) -> None:
         self.number, self.key, self.lease = number, f"p{number}", lease
+        self.renewed_s = time.monotonic()
         self._worker = worker
         self._stop = asyncio.Event()
         self._source = MessageSource(worker.broker.stream, number)
@@ -340,11 +344,12 @@ class _Holder:
         self._partition = Partition(worker.resolve, budget, await self._announced(), last)
 
     async def _announced(self) -> dict[str, ProfileMessage]:
-        """Return the profiles that are known of all robots."""
-        found = {}
+        """Return the profiles that are known of the robots of this partition."""
+        found, of = {}, self._worker.settings.partitions
         for name, entry in (await entries(self._worker.buckets.profiles)).items():
-            with suppress(InputError):
-                found[name] = parse_profile(entry.value or b"")
+            if names.partition_of(name, of) == self.number:
+                with suppress(InputError):
+                    found[name] = parse_profile(entry.value or b"")
         return found
 
     async def _step(self) -> bool:
@@ -441,18 +446,23 @@ class _Holder:
     async def _report(self) -> None:
         """Publish health and lag now and then; robots whose state changes by themselves."""
         now_s, before = time.monotonic(), self._reported
-        if now_s - before.at_s < HEALTH_S:
+        if now_s - before.at_s < HEALTH_S or not self._source.heard_to_s:
             return
-        robots = self._partition.health()
+        if now_s - self.renewed_s > UNCHANGED * RENEW_S:  # paused or cut off: may be another's
+            return
+        robots, remarks = self._partition.health(), dict(self._partition.remarks)
         for table in robots.values():
-            if self._source.heard_to_s - table["heard"] > SILENCE_S and self._source.pending == 0:
+            if self._source.heard_to_s - table["heard"] > SILENCE_S:
                 table["state"] = STALE
+        for name in remarks.keys() - before.remarks:
+            self._worker.outlets.tell(f"{name}: message left out: {remarks[name]}")
         rate = self._taken / (now_s - before.at_s) if math.isfinite(before.at_s) else 0.0
         report = {
             "worker": self._worker.settings.name,
             "at": time.time(),
             "robots": robots,
             "counts": dict(self._partition.counts),
+            "remarks": remarks,
             "pending": self._source.pending,
             "lag_s": round(self._lag_s, 3),
             "messages_per_s": round(rate, 1),
@@ -467,7 +477,7 @@ class _Holder:
             waiting = f"{self._source.pending} messages, {self._lag_s:.0f} s behind"
             said = f"cannot follow: {waiting}; nothing is lost" if behind else "follows again"
             self._worker.outlets.tell(f"partition {self.number}: {said}")
-        self._reported = _Reported(now_s, states, behind)
+        self._reported = _Reported(now_s, states, behind, frozenset(remarks))
         self._worker.outlets.metrics.report(self.key, report)
         await self._publish_health(report, changed)
 
