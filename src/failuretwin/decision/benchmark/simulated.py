@@ -237,7 +237,9 @@ def load_set(arm: str, name: str, data: Path) -> xr.Dataset:
         path.parent.mkdir(parents=True, exist_ok=True)
         save_run_set(make_set(arm, name), path)
     runs = load_run_set(path)
-    _check_same(path, "variables", sorted(runs.variables), sorted([*VARIABLES, *COORDINATES]))
+    _check_same(
+        path, "variables", sorted(map(str, runs.variables)), sorted([*VARIABLES, *COORDINATES])
+    )
     _check_same(path, "attributes", runs.attrs, attributes_of(arm, name))
     _check_same(path, "checksum", checksum(runs)[:12], official()[f"{arm}/{name}"][:12])
     return runs
