@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import sys
 import tarfile
 from pathlib import Path
@@ -251,3 +253,21 @@ def test_a_broken_download_is_refused(bytes_kept, tmp_path):
     error = CliRunner().invoke(cli, words).exception
     assert isinstance(error, InputError)
     assert "cannot be read as .tar.gz" in str(error) and "Fetch it again" in str(error)
+
+
+MAIN = "from failuretwin.app.cli import main; main()"
+
+
+def test_scores_do_not_depend_on_threads(data, tmp_path):
+    answers = []
+    for threads in ("1", "2"):
+        out = tmp_path / threads
+        part = f"--tasks set_up --arms armpi_fpv --data {data} --out {out}"
+        words = f"benchmark run --method kalman {part}".split()
+        names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+        environment = os.environ | dict.fromkeys(names, threads) | {"PYTHONHASHSEED": threads}
+        subprocess.run([sys.executable, "-c", MAIN, *words], env=environment, check=True)
+        answers.append(json.loads((out / runner.RESULTS).read_text()))
+    one, two = answers
+    assert one["scores"] and one["scores"] == two["scores"]
+    assert one["answers"] == two["answers"]
