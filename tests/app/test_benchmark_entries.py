@@ -138,6 +138,13 @@ def test_kept_answers_are_announced(entries, data):
     assert "note: 1 answered case of out kept" in run("strange_entries:Equal", data).output
 
 
+def test_a_later_part_keeps_the_scores_of_earlier_ones(entries, data):
+    run("strange_entries:Equal", data)
+    run("strange_entries:Equal", data, tasks="cold")
+    scores = json.loads(Path("out", runner.RESULTS).read_text())["scores"]
+    assert {score["task"] for score in scores} == {"set_up", "cold"}
+
+
 # Results of other people.
 
 

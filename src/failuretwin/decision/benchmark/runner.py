@@ -176,7 +176,7 @@ def wanted_work(
 def run_entry(
     method: str, work: Sequence[Work], out: Path, on_progress: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Answer the cases that have no answers yet in `out`; return and write the results.
+    """Answer the cases that have no answers yet in `out`; return and write the results of all.
 
     Raises:
         InputError: If `out` holds the results of another entry or of other data.
@@ -190,7 +190,9 @@ def run_entry(
                 results["seconds"][one.name] = round(time.perf_counter() - start, 2)
                 _write(results, out)
         on_progress(1)
-    results["scores"] = list(_scored(work, out))
+    every = [Work(arm, case, work[0].data) for arm in simulated.ARMS for case in CASES]
+    answered = [one for one in every if one.answers_in(out).exists()]
+    results["scores"] = list(_scored(answered, out))
     results["answers"] = {
         path.name: sha256(path.read_bytes()) for path in sorted((out / ANSWERS).glob("*.jsonl"))
     }
