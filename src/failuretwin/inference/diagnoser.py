@@ -330,7 +330,7 @@ class CheckedDiagnoser:
         if [d.run for d in found] != [str(name) for name in runs["run"].values]:
             raise InputError(f"{self.name}: its diagnoses do not name the runs, in their order.")
         made = [
-            replace(d, truth=true, posterior=self._posterior(d))
+            replace(d, truth=true, posterior=checked_posterior(d, self.name))
             for d, true in zip(found, truth, strict=True)
         ]
         return [d if d.verdict else self._worded(d) for d in made]
@@ -339,18 +339,23 @@ class CheckedDiagnoser:
         ranked = [Hypothesis.parse(name) for name in diagnosis.ranked]
         return worded(diagnosis, ranked, arm_class=self.arm_class)
 
-    def _posterior(self, diagnosis: Diagnosis) -> dict[str, float]:
-        """Return the posterior as plain numbers; refuse what is none."""
-        told = {str(name): float(share) for name, share in diagnosis.posterior.items()}
-        for name in told:
-            Hypothesis.parse(name)
-        shares = np.array(list(told.values()))
-        if not (len(shares) and (shares >= 0.0).all() and abs(shares.sum() - 1.0) < 1e-6):
-            raise InputError(
-                f"{self.name}: the posterior of run {diagnosis.run} is {told}. Expected "
-                "probabilities from 0 to 1 that sum to 1."
-            )
-        return told
+
+def checked_posterior(diagnosis: Diagnosis, name: str) -> dict[str, float]:
+    """Return the posterior of a diagnosis by the user's class `name`, as plain numbers.
+
+    Raises:
+        InputError: If it is not one: other names, or numbers that are no probabilities.
+    """
+    told = {str(name): float(share) for name, share in diagnosis.posterior.items()}
+    for hypothesis in told:
+        Hypothesis.parse(hypothesis)
+    shares = np.array(list(told.values()))
+    if not (len(shares) and (shares >= 0.0).all() and abs(shares.sum() - 1.0) < 1e-6):
+        raise InputError(
+            f"{name}: the posterior of run {diagnosis.run} is {told}. Expected "
+            "probabilities from 0 to 1 that sum to 1."
+        )
+    return told
 
 
 def _imported(name: str, text: str) -> Any:

@@ -200,7 +200,7 @@ def twin(armpi):
 
 
 def test_a_classifier_learns_from_what_the_track_allows(healthy, twin):
-    entry = Classifier(Adaptive, twin, lambda: healthy)
+    entry = Classifier(Adaptive, twin, lambda: healthy, "m:C")
     entry.fit(healthy)
     entry.fit(healthy.drop_vars("fault"))
     answers = entry.diagnose(healthy)
@@ -211,7 +211,7 @@ def test_a_classifier_learns_from_what_the_track_allows(healthy, twin):
 
 def test_a_classifier_that_cannot_adapt_does_not_take_part(healthy, twin):
     with pytest.raises(NotEnteredError):
-        Classifier(Constant, twin, lambda: healthy).fit(healthy.drop_vars("fault"))
+        Classifier(Constant, twin, lambda: healthy, "m:C").fit(healthy.drop_vars("fault"))
 
 
 def test_probabilities_of_other_classes_are_refused(healthy, twin):
@@ -219,7 +219,7 @@ def test_probabilities_of_other_classes_are_refused(healthy, twin):
         columns = 3
 
     with pytest.raises(InputError, match=r"gave shape \(20, 3\)"):
-        Classifier(Wrong, twin, lambda: healthy).diagnose(healthy)
+        Classifier(Wrong, twin, lambda: healthy, "m:C").diagnose(healthy)
 
 
 def test_an_unknown_entry_is_refused(twin):
@@ -276,11 +276,13 @@ def test_files_are_known_by_their_content(little_set, tmp_path):
     for place, given in {"x": tmp_path / "elsewhere", "y": tmp_path / "all.tar.gz"}.items():
         assert real.fetch("little", tmp_path / place, given) == 3
         assert real.fetch("little", tmp_path / place, given) == 0
-        folder = real.folder_of("little", tmp_path / place)
+        folder = tmp_path / place / "little"
+        folders = real.folders_of("little", tmp_path / place)
+        assert folders == [folder / "label_0", folder / "label_1"]
         assert (folder / "label_1" / "copy.csv").read_bytes() == b"two"
     (folder / "label_0" / "a.csv").write_bytes(b"One")
     with pytest.raises(InputError, match="is not the published file"):
-        real.folder_of("little", tmp_path / "y")
+        real.folders_of("little", tmp_path / "y")
 
 
 def test_an_incomplete_copy_is_refused(little_set, tmp_path):

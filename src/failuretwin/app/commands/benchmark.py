@@ -111,6 +111,9 @@ def run(method: str, out: Path, part: WorkOptions) -> None:
     from failuretwin.decision.benchmark.runner import RESULTS, run_entry
 
     work = part.work
+    kept = sum(one.answers_in(out).exists() for one in work)
+    if kept:
+        tell(f"note: {counted(kept, 'answered case')} of {out} kept, not answered anew", err=True)
     with progress_bar("cases", len(work)) as advance:
         results = run_entry(method, work, out, advance)
     if not results["scores"]:
@@ -135,12 +138,17 @@ def submit_file(results: Path, name: str, out: Path, data: Path) -> None:
 @benchmark.command()
 @click.argument("files", nargs=-1, type=opt.PATH, metavar="[FILE.json|DIR]...")
 @opt.file_option("--out", "DIR", "Folder for the page.", required=True)
-def page(files: tuple[Path, ...], out: Path) -> None:
-    """Write a page with the table of these results beside those of the bundled entries."""
-    from failuretwin.app.reports.benchmark_page import write_benchmark_page
-    from failuretwin.decision.benchmark.runner import RESULTS, read_submission
+@data_option
+def page(files: tuple[Path, ...], out: Path, data: Path) -> None:
+    """Write a page with the table of these results beside those of the bundled entries.
 
-    entries = [read_submission(file / RESULTS if file.is_dir() else file) for file in files]
+    Files of submit-file are scored again from their answers.
+    """
+    from failuretwin.app.reports.benchmark_page import write_benchmark_page
+    from failuretwin.decision.benchmark.runner import RESULTS, read_submission, scored_again
+
+    paths = [file / RESULTS if file.is_dir() else file for file in files]
+    entries = [scored_again(read_submission(path), path, data) for path in paths]
     tell(f"written to {write_benchmark_page(entries, out)}")
 
 
@@ -174,6 +182,8 @@ def fetch(names: tuple[str, ...], source: Path | None, data: Path) -> None:
         return
     for name in names:
         check_name("set", name, [*sets, "simulated"])
+    if "simulated" in names:
+        opt.refuse_unused("simulated sets are made here", "source")
     for name in names:
         if name != "simulated":
             new = real.fetch(name, data, source)

@@ -65,18 +65,18 @@ def comparison_tables(entries: Sequence[Entry]) -> list[Table]:
     """Return a table for each task: one row for each arm and track, one column for each entry."""
     tables = []
     for task, metric in HEADLINES.items():
-        found: dict[tuple[str, str], dict[str, str]] = {}
-        for entry in entries:
+        found: dict[tuple[str, str], dict[int, str]] = {}
+        for place, entry in enumerate(entries):
             for score in entry["scores"]:
                 if (score["task"], score["metric"]) == (task, metric):
                     where = found.setdefault((score["arm"], score["track"]), {})
-                    where[_name(entry)] = figure(score)
-        names = [_name(entry) for entry in entries]
+                    where[place] = figure(score)
         rows = [
-            (arm, track, *(cells.get(name, "-") for name in names))
+            (arm, track, *(cells.get(place, "-") for place in range(len(entries))))
             for (arm, track), cells in found.items()
         ]
         if rows:
+            names = [_name(entry) for entry in entries]
             title = f"{task}: {TASKS[task].question} {metric[0].upper()}{metric[1:]}"
             tables.append(Table(("arm", "track", *names), rows, title=title))
     return tables

@@ -13,12 +13,13 @@ X is (run, 100 times channel): at each tenth of a second the commands [rad], the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from failuretwin.core.errors import InputError, needs_extra
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.errors import InputError, check_name, needs_extra
+from failuretwin.core.hypothesis import PAPER_MODES, Diagnosis, single_faults
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.learned.feature_encoder import (
@@ -27,7 +28,11 @@ from failuretwin.decision.learned.feature_encoder import (
     signals_of,
 )
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.diagnoser import class_from_text, diagnoser_from_text
+from failuretwin.inference.diagnoser import (
+    checked_posterior,
+    class_from_text,
+    diagnoser_from_text,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -73,9 +78,9 @@ class Classifier:
     """A scikit-learn classifier as an entry; it is fitted when the first answer is wanted."""
 
     def __init__(
-        self, make: Callable[[], Any], twin: DigitalTwin, train: Callable[[], xr.Dataset]
+        self, kind: type[Any], twin: DigitalTwin, train: Callable[[], xr.Dataset], name: str
     ) -> None:
-        self._made, self._twin, self._train = make(), twin, train
+        self._made, self._twin, self._train, self._name = _made(kind, name), twin, train, name
         self._known: list[xr.Dataset] = []
         self._fitted = False
 
@@ -102,16 +107,44 @@ class Classifier:
         """Return the probabilities of the classifier as diagnoses."""
         self._learn()
         chances = np.asarray(self._made.predict_proba(features_of(runs, self._twin)))
-        names = [str(name) for name in self._made.classes_]
+        names = self._classes
         if chances.shape != (runs.sizes["run"], len(names)):
             raise InputError(
-                f"predict_proba gave shape {chances.shape}. Expected one row per run and one "
-                f"column per class, ({runs.sizes['run']}, {len(names)})."
+                f"{self._name}: predict_proba(X) gave shape {chances.shape}. Expected one row per "
+                f"run and one column per class, ({runs.sizes['run']}, {len(names)})."
             )
-        return [
-            Diagnosis(str(run), dict(zip(names, map(float, row), strict=True)))
+        found = [
+            Diagnosis(str(run), dict(zip(names, row, strict=True)))
             for run, row in zip(runs["run"].values, chances, strict=True)
         ]
+        return [replace(one, posterior=checked_posterior(one, self._name)) for one in found]
+
+    @property
+    def _classes(self) -> list[str]:
+        """The classes that the columns of predict_proba mean."""
+        if not hasattr(self._made, "classes_"):
+            raise InputError(
+                f"{self._name}: has no `classes_` after fit(X, y). Expected the labels of y in the "
+                "order of the columns of predict_proba(X)."
+            )
+        names = [str(name) for name in self._made.classes_]
+        labels = [str(h) for h in single_faults(self._twin.robot.motor_names, PAPER_MODES)]
+        for name in names:
+            check_name("label", name, labels, f"{self._name}: classes_: ")
+        return names
+
+
+def _made(kind: type[Any], name: str) -> Any:
+    try:
+        made = kind()
+    except TypeError as error:
+        raise InputError(
+            f"{name}: cannot be made without arguments ({error}). Expected a default for each "
+            "argument of __init__."
+        ) from error
+    if not callable(getattr(made, "fit", None)):
+        raise InputError(f"{name}: has no method `fit`. Expected fit(X, y).")
+    return made
 
 
 class Diagnosing:
@@ -149,9 +182,15 @@ def entry_of(method: str, twin: DigitalTwin, train: Callable[[], xr.Dataset]) ->
         with needs_extra("classifiers need scikit-learn", "learn"):
             import sklearn  # noqa: F401
     kind = class_from_text(text)
-    if hasattr(kind, "predict_proba") and not hasattr(kind, "diagnose"):
-        return Classifier(kind, twin, train)
-    return Diagnosing(text, twin)
+    if hasattr(kind, "diagnose"):
+        return Diagnosing(text, twin)
+    if hasattr(kind, "predict_proba"):
+        return Classifier(kind, twin, train, text)
+    raise InputError(
+        f"{text}: has neither `predict_proba` nor `diagnose`. Expected a classifier with "
+        "fit(X, y) and predict_proba(X), or a class with diagnose(runs). scikit-learn's "
+        "CalibratedClassifierCV adds predict_proba to a classifier."
+    )
 
 
 def named_runs(runs: xr.Dataset, hypotheses: Sequence[str]) -> xr.Dataset:

@@ -12,6 +12,7 @@ import json
 import shutil
 import tarfile
 import urllib.request
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -78,8 +79,10 @@ def real_sets() -> Mapping[str, RealSet]:
     return {name: from_table(RealSet, table, name) for name, table in stored.items()}
 
 
-def folder_of(name: str, data: Path) -> Path:
-    """Return the folder of a recorded set, once all its files are there and unchanged.
+def folders_of(name: str, data: Path) -> list[Path]:
+    """Return the folders of a recorded set, once all its files are there and unchanged.
+
+    Other folders beside them do not belong to the set.
 
     Raises:
         InputError: If a file is missing or was changed.
@@ -92,7 +95,7 @@ def folder_of(name: str, data: Path) -> Path:
             f"{missing[0]}. Fetch them: failuretwin data fetch {name} --data {data}, or from a "
             "copy of your own with --from FOLDER."
         )
-    return folder
+    return sorted({(folder / path).parent for path in real.files})
 
 
 def fetch(name: str, data: Path, source: Path | None) -> int:
@@ -146,9 +149,10 @@ def _contents(real: RealSet, source: Path | None) -> Iterator[bytes]:
                 file = opened.extractfile(member) if member.isfile() else None
                 if file is not None:
                     yield file.read()
-    except tarfile.TarError as error:
+    except (tarfile.TarError, EOFError, OSError, zlib.error) as error:
         raise InputError(
-            f"{source or real.repository}: cannot be read as .tar.gz ({reason(error)})."
+            f"{source or real.repository}: cannot be read as .tar.gz ({reason(error)}). Fetch it "
+            "again, or unpack it and name the folder."
         ) from error
 
 

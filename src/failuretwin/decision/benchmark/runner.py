@@ -12,20 +12,28 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from failuretwin import __version__
 from failuretwin.core.config import from_table
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, check_name, counted
 from failuretwin.core.foreign import read_text, reading
 from failuretwin.core.runs import concatenate
-from failuretwin.data_knowledge.readers.raw_sessions import find_sessions
 from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import write_text
 from failuretwin.decision.benchmark import simulated
 from failuretwin.decision.benchmark.entries import NotEnteredError, entry_of, named_runs
-from failuretwin.decision.benchmark.real import folder_of, sha256
-from failuretwin.decision.benchmark.tasks import CASES, REAL, TASKS, Case, Judgement, Score
+from failuretwin.decision.benchmark.real import folders_of, sha256
+from failuretwin.decision.benchmark.tasks import (
+    CASES,
+    REAL,
+    TASKS,
+    Answers,
+    Case,
+    Judgement,
+    Score,
+)
 from failuretwin.decision.evaluation import Truths
 from failuretwin.decision.results import read_results, write_json_lines
 from failuretwin.digital_model.robot import load_robot
@@ -89,11 +97,13 @@ class Work:
         return [Fold(together, test)]
 
     def _sessions(self) -> Iterator[Fold]:
-        robot, folder = load_robot(self.arm), folder_of(REAL, self.data)
-        sessions = find_sessions(folder)
-        options = ReadOptions(published_labels=True)
+        robot, sessions = load_robot(self.arm), folders_of(REAL, self.data)
+        runs = read_runs(sessions, robot, ReadOptions(published_labels=True))
+        session_of = [str(name).partition("/")[0] for name in runs["run"].values]
+        runs = runs.assign_coords(session=("run", session_of)).assign_attrs(individual="real")
+        runs = simulated.shuffled(runs, f"{self.arm}-real")  # names of sessions hold labels
         if self.plan.track != "P0c":
-            test = read_runs(folder, robot, options).assign_attrs(individual="real")
+            test = runs.drop_vars("session")
             yield Fold((self._public(test),) if self.plan.track == "P1" else (), test)
             return
         healthy = [session for session in sessions if session.name.endswith(HEALTHY_LABELS)]
@@ -101,14 +111,18 @@ class Work:
             known = read_runs([other for other in healthy if other != session], robot)
             truth = ["healthy"] * known.sizes["run"]
             known = known.assign(fault=("run", truth)).assign_attrs(individual="real")
-            test = read_runs(session, robot, options).assign_attrs(individual="real")
-            yield Fold((known,), test)
+            test = runs.isel(run=runs["session"].values == session.name)
+            yield Fold((known,), test.drop_vars("session"))
 
     def _public(self, runs: xr.Dataset) -> xr.Dataset:
         """Return what an entry may see of test runs."""
         seen = runs[["command", "measured", "duration"]]
         names = [str(h) for h in simulated.classes_of(self.arm)]
         return named_runs(seen, [*names, "unknown"] if self.plan.unknown else names)
+
+    def answers_in(self, out: Path) -> Path:
+        """Return the file of answers in the folder of an entry."""
+        return out / ANSWERS / f"{self.name}.jsonl"
 
     def answer(self, method: str, path: Path) -> bool:
         """Write an entry's answers; return whether it takes part in the case."""
@@ -122,6 +136,7 @@ class Work:
             except NotEnteredError:
                 return False
             found += entry.diagnose(self._public(fold.test))
+        path.parent.mkdir(parents=True, exist_ok=True)
         write_json_lines(found, path)
         return True
 
@@ -161,22 +176,23 @@ def wanted_work(
 def run_entry(
     method: str, work: Sequence[Work], out: Path, on_progress: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Answer the cases that have no answers yet in `out`; return and write the results.
+    """Answer the cases that have no answers yet in `out`; return and write the results of all.
 
     Raises:
         InputError: If `out` holds the results of another entry or of other data.
     """
     results = _begun(method, out)
     for one in work:
-        path = out / ANSWERS / f"{one.name}.jsonl"
+        path = one.answers_in(out)
         if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
             start = time.perf_counter()
             if one.answer(method, path):
                 results["seconds"][one.name] = round(time.perf_counter() - start, 2)
                 _write(results, out)
         on_progress(1)
-    results["scores"] = list(_scored(work, out))
+    every = [Work(arm, case, work[0].data) for arm in simulated.ARMS for case in CASES]
+    answered = [one for one in every if one.answers_in(out).exists()]
+    results["scores"] = list(_scored(answered, out))
     results["answers"] = {
         path.name: sha256(path.read_bytes()) for path in sorted((out / ANSWERS).glob("*.jsonl"))
     }
@@ -207,17 +223,29 @@ def _scored(work: Sequence[Work], out: Path) -> Iterator[dict[str, Any]]:
     """Yield every score of the cases that were answered."""
     for one in work:
         for key, task in TASKS.items():
-            files = [out / ANSWERS / f"{one.arm}-{n}.jsonl" for n in (one.case, *task.parts)]
+            cases = (one.case, *task.parts)
+            files = [Work(one.arm, case, one.data).answers_in(out) for case in cases]
             if one.case not in task.cases or not all(path.exists() for path in files):
                 continue
-            answers = read_results(files[0]).diagnoses
-            parts = {
-                part: read_results(path).diagnoses
-                for part, path in zip(task.parts, files[1:], strict=True)
-            }
-            for score in task.score(Judgement(answers, one.truths, parts)):
+            truths = one.truths
+            answers, *others = [_answers(path, truths) for path in files]
+            parts = dict(zip(task.parts, others, strict=True))
+            for score in task.score(Judgement(answers, truths, parts)):
                 where = {"task": key, "arm": one.arm, "case": one.case, "track": one.plan.track}
                 yield where | _rounded(score)
+
+
+def _answers(path: Path, truths: Truths) -> Answers:
+    """Return the answers of a file, one to each run of the case."""
+    answers = read_results(path).diagnoses
+    found, expected = sorted(answer.run for answer in answers), sorted(truths.by_run)
+    if found != expected:
+        missing = len(set(expected) - set(found))
+        raise InputError(
+            f"{path}: holds {counted(len(found), 'answer')}, and none to {missing} of the "
+            f"{len(expected)} runs. Expected one to each. Remove it and run the entry again."
+        )
+    return answers
 
 
 def _rounded(score: Score) -> dict[str, Any]:
@@ -279,22 +307,46 @@ def pack(out: Path, name: str, data: Path, path: Path) -> int:
     Returns the number of scores.
 
     Raises:
-        InputError: If answers were changed after the run.
+        InputError: If there are no scores, or answers were changed after the run.
     """
+    if not (out / RESULTS).is_file():
+        raise InputError(f"{out}: has no {RESULTS}. Expected the --out of `benchmark run`.")
     results = read_submission(out / RESULTS)
-    answers = {}
+    fix = "Run the entry again."
+    answers = {file: read_text(out / ANSWERS / file, "answers", fix) for file in results["answers"]}
     for file, expected in results["answers"].items():
-        text = read_text(out / ANSWERS / file, "answers")
-        if sha256(text.encode()) != expected:
+        if sha256(answers[file].encode()) != expected:
             raise InputError(
                 f"{out / ANSWERS / file}: was changed after the run. Remove it and run the entry "
                 "again."
             )
-        answers[file] = text
-    work = []
-    for file in answers:
-        arm, _, case = file.removesuffix(".jsonl").partition("-")
-        work.append(Work(arm, case, data))
-    results["scores"] = list(_scored(work, out))
-    write_text(json.dumps({**results, "name": name, "texts": answers}, indent=1), path)
-    return len(results["scores"])
+    packed = scored_again({**results, "name": name, "texts": answers}, out, data)
+    if not packed["scores"]:
+        raise InputError(f"{out}: has no scores. Expected answers to all cases of one task.")
+    write_text(json.dumps(packed, indent=1), path)
+    return len(packed["scores"])
+
+
+def scored_again(stored: Mapping[str, Any], path: Path, data: Path) -> dict[str, Any]:
+    """Return results with the scores of their own answers; without answers, as they are.
+
+    Raises:
+        InputError: If the answers are to unknown cases, or not to all runs of a case.
+    """
+    texts = stored.get("texts")
+    if texts is None:
+        return dict(stored)
+    work = [_work_of(file, path, data) for file in texts]
+    with TemporaryDirectory() as folder:
+        for one, text in zip(work, texts.values(), strict=True):
+            one.answers_in(Path(folder)).parent.mkdir(exist_ok=True)
+            write_text(str(text), one.answers_in(Path(folder)))
+        return {**stored, "scores": list(_scored(work, Path(folder)))}
+
+
+def _work_of(file: str, path: Path, data: Path) -> Work:
+    """Return the case that a file of answers is of."""
+    arm, _, case = file.removesuffix(".jsonl").partition("-")
+    check_name("arm", arm, simulated.ARMS, f"{path}: answers: ")
+    check_name("case", case, CASES, f"{path}: answers: ")
+    return Work(arm, case, data)

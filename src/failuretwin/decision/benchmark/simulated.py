@@ -55,7 +55,8 @@ NOISE_OF_REACH = 5e-4
 POSITION_M, ANGLE_RAD, TRUTH = 1e-5, 1e-6, 1e-6
 """One count of positions, of angles, and of true onsets and sizes."""
 MISSING = np.iinfo(np.int32).min
-TRUTHS = ("fault", "onset", "magnitude")
+VARIABLES = ("command", "measured", "duration", "fault", "onset", "magnitude")
+COORDINATES = ("run", "time", "motor", "axis")
 MOVING = RandomMovements(count=8, period_s=1.25, ramp_shares=(1.0,))
 """Movements that begin where the last one ends: the arm never rests."""
 
@@ -131,22 +132,30 @@ def make_set(arm: str, name: str) -> xr.Dataset:
         seed = [SEED, ARMS.index(arm), list(SETS).index(name), step]
         number = int(np.random.SeedSequence(seed).generate_state(1)[0])
         parts.append(simulate(_plan(robot, kind, factor, number)))
-    runs = concatenate(parts)
-    order = np.random.default_rng([SEED, len(runs["run"])]).permutation(len(runs["run"]))
-    runs = runs.isel(run=order)[["command", "measured", "duration", *TRUTHS]]
-    names = np.array([f"{arm}-{name}-{number:04d}" for number in range(len(order))], dtype=object)
-    runs = runs.assign_coords(run=("run", names))
+    runs = shuffled(concatenate(parts)[[*VARIABLES]], f"{arm}-{name}")
     if wanted.reversed_motor is not None:
         sign = np.ones(len(robot.motors))
         sign[wanted.reversed_motor - 1] = -1.0
         runs["command"] = (runs["command"].dims, runs["command"].values * sign)
-    runs.attrs = {
+    runs.attrs = attributes_of(arm, name)
+    return _in_counts(runs)
+
+
+def shuffled(runs: xr.Dataset, name: str) -> xr.Dataset:
+    """Return runs in random order, named by number: neither tells their faults."""
+    order = np.random.default_rng([SEED, runs.sizes["run"]]).permutation(runs.sizes["run"])
+    names = np.array([f"{name}-{number:04d}" for number in range(len(order))], dtype=object)
+    return runs.isel(run=order).assign_coords(run=("run", names))
+
+
+def attributes_of(arm: str, name: str) -> dict[str, Any]:
+    """Return the attributes of a data set."""
+    return {
         "robot": arm,
-        "individual": wanted.robot,
-        "source": f"benchmark {VERSION}, simulated: {wanted.content}",
+        "individual": SETS[name].robot,
+        "source": f"benchmark {VERSION}, simulated: {SETS[name].content}",
         "measured_rate_hz": RATE_HZ,
     }
-    return _in_counts(runs)
 
 
 def _plan(robot: Robot, wanted: SimulatedSet, factor: float, seed: int) -> Plan:
@@ -228,13 +237,20 @@ def load_set(arm: str, name: str, data: Path) -> xr.Dataset:
         path.parent.mkdir(parents=True, exist_ok=True)
         save_run_set(make_set(arm, name), path)
     runs = load_run_set(path)
-    found, expected = checksum(runs), official()[f"{arm}/{name}"]
+    _check_same(
+        path, "variables", sorted(map(str, runs.variables)), sorted([*VARIABLES, *COORDINATES])
+    )
+    _check_same(path, "attributes", runs.attrs, attributes_of(arm, name))
+    _check_same(path, "checksum", checksum(runs)[:12], official()[f"{arm}/{name}"][:12])
+    return runs
+
+
+def _check_same(path: Path, what: str, found: object, expected: object) -> None:
     if found != expected:
         raise InputError(
-            f"{path}: has checksum {found[:12]}, expected {expected[:12]}: the file was changed, "
-            "or another version of the package made it. Remove it and run the command again."
+            f"{path}: has {what} {found}, expected {expected}: the file was changed, or another "
+            "version of the package made it. Remove it and run the command again."
         )
-    return runs
 
 
 def classes_of(arm: str) -> tuple[Hypothesis, ...]:
