@@ -109,6 +109,7 @@ def test_what_was_learned_is_what_the_robot_does(armpi, twin):
     error = np.abs(np.asarray(learned.settling.bias) - true)
     assert (error < 4.0 * np.asarray(learned.imperfections.variation.bias) + 5e-4).all()
     assert error.max() < 0.004
+    assert learned.settling.tail_dof <= given.tail_dof  # of one motor, not of all together
 
 
 def test_the_limit_of_lost_commands(armpi):

@@ -124,12 +124,20 @@ class LifeLearner:
         life.follow(replace(run, movements=_from_zero(run.movements)))
 
     def _model(self) -> HealthyModel:
-        """Return the robot as it is believed to be by now, with what is left of the doubt."""
+        """Return the robot as it is believed to be by now, with what is left of the doubt.
+
+        A life fits one tail to all motors together. What several scatter in one movement is nearer
+        to a normal than what each does, and a watch must know how far one motor scatters by itself:
+        its tail is at least as heavy as usual of the kind.
+        """
         life, learned = self._life, self._life.learned
         _, deviation = life.offsets
         settling = replace(life.model, imperfections=learned).settling
+        usual = replace(life.model, imperfections=life.begun).settling.tail_dof
+        alone = replace(settling, tail_dof=min(settling.tail_dof, usual))
         doubt = stated_variation(deviation, settling, learned.variation)
-        return replace(life.model, imperfections=replace(learned, variation=doubt))
+        known = replace(learned, settling=alone, variation=doubt)
+        return replace(life.model, imperfections=known)
 
 
 def _learning(now: Imperfections) -> Imperfections:

@@ -100,6 +100,12 @@ class FaultBelief(ArrayStruct):
             self.healthy
         )
 
+    def renewed(self, share: FloatArray) -> FaultBelief:
+        """Return the belief if each robot is another, healthy one with a probability, (robot,)."""
+        kept = (1.0 - share)[:, None]
+        healthy = self.healthy * (1.0 - share) + share
+        return replace(self, healthy=healthy, held=kept * self.held, off=kept * self.off)
+
 
 @dataclass(frozen=True)
 class FaultEvidence(ArrayStruct):
