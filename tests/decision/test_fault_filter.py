@@ -213,8 +213,8 @@ def test_candidates_are_weighed_by_what_they_foretold(faults):
         belief = mixture.advance(belief, seen, m)
         came = CHANGED / 2.0 * (1.0 - weight)
         weight = (1.0 - CHANGED) * weight + CHANGED / 2.0
-        new = [a.renewed(share[None]) for a, share in zip(alone, came / weight, strict=True)]
-        alone = [faults.advance(a, says, m) for a, says in zip(new, seen, strict=True)]
+        parts = zip(alone, seen, (came / weight)[:, None], strict=True)
+        alone = [faults.advance(a, says, m, new) for a, says, new in parts]
         density = [
             np.exp(says.healthy[0, m] + a.log_predictive[0])
             for a, says in zip(alone, seen, strict=True)

@@ -42,7 +42,7 @@ def seen(model, off, usable=(True, True, True, True), lost=()):
     direction = np.sign(base - stood)
     for m in lost:
         base[m, 0], direction[m, 0] = base[m - 1, 0], direction[m - 1, 0]
-    angle = model.settle(base + off, direction, model.none_held)
+    angle = model.settle(base, direction, model.none_held) + off
     return SettledEvidence(
         movements=told,
         point=model.sensors.value(angle)[None],

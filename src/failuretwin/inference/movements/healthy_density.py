@@ -20,7 +20,6 @@ Section: docs/inference.md#streams
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -29,7 +28,7 @@ from scipy import stats
 
 from failuretwin.core.numerics import Covariance, log_norm, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.movements.joint_likelihood import JointLikelihood, MovementLikelihoods
+from failuretwin.inference.movements.joint_likelihood import MovementLikelihoods
 from failuretwin.inference.observation.command_loss import CommandOutcomes
 from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -68,53 +67,60 @@ def healthy_log_density(
     pose = model.settle(base, outcomes.direction[possible], model.none_held)
     point = np.broadcast_to(evidence.point[:, :, None], (*possible.shape, model.sensors.channels))
     made = np.broadcast_to(outcomes.missed == 0, mean.shape)[possible]
-    error, _, spread = model.residual(point[possible], pose, deviation[possible])
-    far = _far(model, found.profiles, lambda values: values[asked][possible])
-    dof = model.settling.tail_dof
-    together = spread.log_student(error, dof) + np.log1p(-_far_rate(dof) * made.sum(axis=-1))
     terms = outcomes.log_weight.copy()
-    terms[possible] += together
-    alone = np.full(terms.shape, -np.inf)
-    alone[possible] = log_sum(np.where(made[..., None], far, -np.inf), axis=(-2, -1))
-    total = np.logaddexp(log_sum(terms, axis=-1), log_sum(alone, axis=-1))
-    total = np.logaddexp(total, model.outlier_log_density)
+    terms[possible] += _log_density(model, point[possible], pose, deviation[possible], made)
+    total = np.logaddexp(log_sum(terms, axis=-1), model.outlier_log_density)
     return np.where(evidence.usable, total, 0.0)
 
 
-def _far(
-    model: HealthyModel,
-    profiles: Sequence[JointLikelihood],
-    of: Callable[[FloatArray], FloatArray],
+def _log_density(
+    model: HealthyModel, point: FloatArray, pose: FloatArray, scale: FloatArray, made: BoolArray
 ) -> FloatArray:
-    """Return log w_a q_i N(r) of each motor that scatters far by itself, (..., motor, variance).
-
-    On the circle on which it takes the tool: so far off, a tangent is not near enough.
+    """Return log p(r) of motors that scatter each by itself, (...).
 
     Args:
         model: The healthy robot.
-        profiles: What the movements say of each motor.
-        of: Which outcomes are asked for, of (run, movement, outcome).
+        point: Settled positions, (..., channel) [m].
+        pose: Angles at which the motors settle, (..., motor) [rad].
+        scale: Scale of their scatter, (..., motor) [rad].
+        made: Motors that made the movement: those alone scatter anew, (..., motor).
     """
+    error, jacobian, spread = model.residual(point, pose, scale)
+    together, alone = _ways(model, (error, jacobian, spread), scale, made)
+    return np.asarray(np.logaddexp(together, log_sum(alone, axis=(-2, -1))))
+
+
+def _ways(
+    model: HealthyModel,
+    residual: tuple[FloatArray, FloatArray, Covariance],
+    scale: FloatArray,
+    made: BoolArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return log p(r, way): all motors scatter together (...); one far (..., motor, variance).
+
+    Args:
+        model: The healthy robot.
+        residual: What `HealthyModel.residual` says.
+        scale: Scale of the motors' scatter, (..., motor) [rad].
+        made: Motors that made the movement, (..., motor).
+    """
+    error, jacobian, spread = residual
     dof, dims = model.settling.tail_dof, model.sensors.dims
+    together = spread.log_student(error, dof)
     share, variance = wide_scatter(dof)
-    off = np.stack([of(one.turned(one.faulty_baseline - one.mode)) for one in profiles], axis=-1)
-    nearest = np.stack([of(one.min_distance2) for one in profiles], axis=-1)
-    precision = np.stack([of(one.precision) for one in profiles], axis=-1)[..., None]
-    weight = np.stack([of(one.log_weight) for one in profiles], axis=-1)
-    inflation = 1.0 + (model.scatter**2)[:, None] * variance * precision
-    square = nearest[..., None] + precision * (off**2)[..., None] / inflation
-    normal = log_norm(np.inf, dims) - log_norm(dof, dims)
-    alone = weight[..., None] + normal - 0.5 * (square + np.log(inflation)) + np.log(share)
-    return np.asarray(alone)
-
-
-def _far_rate(dof: float) -> float:
-    """Return the share of movements in which one given motor scatters far by itself."""
-    return float(wide_scatter(dof)[0].sum())
+    pull = np.einsum("...ak,...a->...k", jacobian, spread.solve(error))[..., None]
+    precision = _own_precision(jacobian, spread)[..., None]
+    more = (variance - 1.0) * (scale**2)[..., None]
+    inflation = 1.0 + more * precision
+    square = spread.product(error, error)[..., None, None] - more * pull**2 / inflation
+    alone = log_norm(np.inf, dims) - 0.5 * np.log(spread.determinant)[..., None, None]
+    alone = alone - 0.5 * (square + np.log(inflation)) + np.log(share)
+    usual = np.log1p(-share.sum() * made.sum(axis=-1))
+    return usual + together, np.where(made[..., None], alone, -np.inf)
 
 
 def _seen_variance(
-    model: HealthyModel, together: FloatArray, far: FloatArray, square: FloatArray
+    model: HealthyModel, residual: tuple[FloatArray, FloatArray, Covariance]
 ) -> FloatArray:
     """Return the variance with which each motor has scattered, by what was seen, (..., motor).
 
@@ -123,17 +129,19 @@ def _seen_variance(
 
     Args:
         model: The healthy robot.
-        together: Log density if all motors scatter together, (...).
-        far: The same if one scatters far, (..., motor, variance).
-        square: D^2, (...).
+        residual: What `HealthyModel.residual` says.
     """
-    dof, dims = model.settling.tail_dof, model.sensors.dims
-    together = together + np.log1p(-_far_rate(dof) * far.shape[-2])
-    total = np.logaddexp(together, log_sum(far, axis=(-2, -1)))
+    error, _, spread = residual
+    dof = model.settling.tail_dof
+    scale = np.broadcast_to(model.scatter, (*error.shape[:-1], len(model.scatter)))
+    together, alone = _ways(model, residual, scale, np.ones(scale.shape, dtype=bool))
+    total = np.logaddexp(together, log_sum(alone, axis=(-2, -1)))
+    far = np.exp(alone - total[..., None, None])
+    square, dims = spread.product(error, error), model.sensors.dims
     common = np.ones_like(square) if np.isinf(dof) else (dof + square) / (dof + dims - 2.0)
-    wider = np.exp(together - total) * (common - 1.0)
-    one = np.exp(far - total[..., None, None]) * (wide_scatter(dof)[1] - 1.0)
-    return np.asarray((1.0 + wider[..., None] + one.sum(axis=-1)) * model.scatter**2)
+    factor = np.exp(together - total) * (common - 1.0)
+    widened = (far * (wide_scatter(dof)[1] - 1.0)).sum(axis=-1)
+    return np.asarray((1.0 + factor[..., None] + widened) * scale**2)
 
 
 @lru_cache(maxsize=64)
@@ -155,11 +163,6 @@ def _own_precision(jacobian: FloatArray, spread: Covariance) -> FloatArray:
     """Return J_k^T S^-1 J_k of each motor, (..., motor) [1/rad2]."""
     columns = np.swapaxes(jacobian, -1, -2)
     return np.stack([spread.product(a, a) for a in np.moveaxis(columns, -2, 0)], axis=-1)
-
-
-def _chosen(values: FloatArray, outcome: IntArray) -> FloatArray:
-    """Return the values of one outcome of each movement, (run, movement)."""
-    return np.take_along_axis(values, outcome[..., None], axis=-1)[..., 0]
 
 
 @dataclass(frozen=True)
@@ -191,14 +194,12 @@ class _Stays:
 
         base, direction = at_best(outcomes.base - outcomes.kept), at_best(outcomes.direction)
         pose = model.settle(base, direction, model.none_held)
-        error, _, spread = model.residual(evidence.point, pose, model.scatter)
-        far = _far(model, found.profiles, lambda values: _chosen(values, best))
-        square = spread.product(error, error)
-        variance = _seen_variance(model, _chosen(found.terms, best), far, square)
+        residual = model.residual(evidence.point, pose, model.scatter)
+        variance = _seen_variance(model, residual)
         error, jacobian, spread = model.residual(evidence.point, pose, np.sqrt(variance))
         own = _own_precision(jacobian, spread)
         others = 1.0 - np.minimum(variance * own, NEARLY_ONE)
-        top = _chosen(found.terms, best)
+        top = np.take_along_axis(found.terms, best[..., None], axis=-1)[..., 0]
         total = np.logaddexp(log_sum(found.terms, axis=-1), model.outlier_log_density)
         trust = np.where(evidence.usable, np.exp(top - total), 0.0)[..., None]
         precision = trust * own / others
@@ -213,27 +214,30 @@ class _Stays:
 
     def kept(self, model: HealthyModel, outcomes: CommandOutcomes) -> tuple[FloatArray, FloatArray]:
         """Return mu and the scale of what is left, (run, movement, outcome, motor) [rad]."""
-        told = self.precision, self.pull, self.more
-        precision, pull, more = (self._since(values, outcomes.missed) for values in told)
+        precision, pull, more = np.moveaxis(self._since(outcomes.missed), -1, 0)
         variance = 1.0 / (1.0 / np.maximum(model.scatter**2 + more, LEAST) + precision)
         left = np.sqrt(variance + np.where(precision > 0.0, model.held_scatter**2, 0.0))
         return variance * pull, left
 
-    def _since(self, values: FloatArray, missed: IntArray) -> FloatArray:
-        """Return what the latest movement of a stay that was seen says of it, (..., motor).
+    def _since(self, missed: IntArray) -> FloatArray:
+        """Return what the latest movement of a stay that was seen says of it, (..., motor, value).
 
         Args:
-            values: By movement, (run, movement, motor).
             missed: Commands in a row that each outcome has missed, (outcome, motor).
+
+        Returns:
+            Precision, pull and more; 0 where nothing was seen.
         """
-        runs, count, motors = values.shape
-        found = np.zeros((runs, count, len(missed), motors))
-        open_ = np.broadcast_to(missed > 0, found.shape).copy()
+        runs, count, _ = self.missed.shape
+        ago = np.zeros((runs, count, *missed.shape), dtype=np.int64)
+        open_ = np.broadcast_to(missed > 0, ago.shape).copy()
         for back in range(1, min(int(missed.max(initial=0)), count - 1) + 1):
             before = slice(0, count - back)
             fits = self.missed[:, before, None] == missed - back
             seen = self.seen[:, before, None, None]
-            now = open_[:, back:] & seen & (missed >= back)
-            found[:, back:] = np.where(now & fits, values[:, before, None], found[:, back:])
+            ago[:, back:][open_[:, back:] & seen & (missed >= back) & fits] = back
             open_[:, back:] &= ~seen
+        told, at = np.stack([self.precision, self.pull, self.more], axis=-1), np.nonzero(ago)
+        found = np.zeros((*ago.shape, told.shape[-1]))
+        found[at] = told[at[0], at[1] - ago[at], at[3]]
         return found

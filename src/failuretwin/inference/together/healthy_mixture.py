@@ -79,9 +79,7 @@ class HealthyMixture:
         came = CHANGED / len(self.filters) * (1.0 - before)
         weight = before * (1.0 - CHANGED + CHANGED / len(self.filters)) + came
         parts = zip(self.filters, belief.beliefs, seen, (came / weight).T, strict=True)
-        beliefs = tuple(
-            one.advance(held.renewed(new), says, movement) for one, held, says, new in parts
-        )
+        beliefs = tuple(one.advance(held, says, movement, new) for one, held, says, new in parts)
         density = np.stack(
             [
                 says.healthy[:, movement] + after.log_predictive
