@@ -211,14 +211,31 @@ def test_candidates_are_weighed_by_what_they_foretold(faults):
     weight = np.array([0.9, 0.1])
     for m in range(3):
         belief = mixture.advance(belief, seen, m)
-        alone = [faults.advance(a, says, m) for a, says in zip(alone, seen, strict=True)]
+        came = CHANGED / 2.0 * (1.0 - weight)
+        weight = (1.0 - CHANGED) * weight + CHANGED / 2.0
+        parts = zip(alone, seen, (came / weight)[:, None], strict=True)
+        alone = [faults.advance(a, says, m, new) for a, says, new in parts]
         density = [
             np.exp(says.healthy[0, m] + a.log_predictive[0])
             for a, says in zip(alone, seen, strict=True)
         ]
-        weight = ((1.0 - CHANGED) * weight + CHANGED / 2.0) * density
+        weight = weight * density
         assert belief.explained[0] == pytest.approx(np.log(weight.sum()), rel=1e-12)
         weight = weight / weight.sum()
     np.testing.assert_allclose(np.exp(belief.log_weight[0]), weight, rtol=1e-10)
     expected = sum(w * faults.posterior(a) for w, a in zip(weight, alone, strict=True))
     np.testing.assert_allclose(mixture.posterior(belief), expected, rtol=1e-10)
+
+
+def test_a_robot_that_has_become_another_is_healthy_at_first(faults):
+    """What a candidate that does not fit took for a fault says nothing of later movements."""
+    rng, mixture = np.random.default_rng(4), HealthyMixture([faults, faults], np.array([0.5, 0.5]))
+    seen = [made_up(faults, 1, rng), made_up(faults, 1, rng)]
+    fits, broken = faults.begin(1), faults.begin(1)
+    broken.healthy[:], broken.off[:, 0] = 1e-9, 1.0 - 1e-9
+    for weight, as_from in ((1e-12, faults.begin(1)), (0.5, broken)):
+        log_weight = np.log([[1.0 - weight, weight]])
+        before = replace(mixture.begin(1), log_weight=log_weight, beliefs=(fits, broken))
+        after = mixture.advance(before, seen, 0).beliefs[1]
+        expected = faults.advance(as_from, seen[1], 0)
+        np.testing.assert_allclose(after.healthy, expected.healthy, rtol=1e-4)

@@ -143,6 +143,19 @@ def test_a_motor_that_missed_a_command_stays_where_it_was_seen(model):
     assert density["stays"] == pytest.approx(expected, abs=0.15)
 
 
+@pytest.mark.parametrize("wide", [4.0, 10.0])
+def test_a_motor_that_scattered_far_stays_there_when_it_misses_a_command(model, wide):
+    """Else two movements in a row would look as if it were stuck where it had scattered to."""
+    model, off = model.seen_by(("tool",)), np.zeros((4, 4))
+    off[2:4, 0] = wide * model.scatter[0]
+    evidence = seen(model, off, lost=(3,))
+    far = healthy_log_density(evidence, movement_likelihoods(evidence, model))[0, 3]
+    off[2:4, 0] = 0.0
+    evidence = seen(model, off, lost=(3,))
+    usual = healthy_log_density(evidence, movement_likelihoods(evidence, model))[0, 3]
+    assert far == pytest.approx(usual, abs=0.8)
+
+
 def test_what_was_not_seen_says_nothing(model):
     evidence = seen(model, np.zeros((4, 4)), (True, False, True, False))
     found = healthy_log_density(evidence, movement_likelihoods(evidence, model))

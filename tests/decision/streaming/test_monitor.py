@@ -11,12 +11,13 @@ from failuretwin import BayesDiagnoser
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import CLEAR, RAISED
 from failuretwin.decision.streaming.alarm_rule import UNUSED, movements_to_tell
-from failuretwin.decision.streaming.learning import RUN, LifeLearner
+from failuretwin.decision.streaming.learning import RUN, LifeLearner, as_watched
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import LostCommand, Schedule, Timing
 from failuretwin.inference.engine.theta import offsets_of
 from failuretwin.inference.observation.evidence import SettledEvidence
+from failuretwin.inference.together.life_filter import LifeFilter
 
 
 def answers(watch, samples):
@@ -109,6 +110,17 @@ def test_what_was_learned_is_what_the_robot_does(armpi, twin):
     error = np.abs(np.asarray(learned.settling.bias) - true)
     assert (error < 4.0 * np.asarray(learned.imperfections.variation.bias) + 5e-4).all()
     assert error.max() < 0.004
+
+
+def test_one_motor_may_scatter_as_far_as_is_usual_of_the_kind(armpi, monkeypatch):
+    """What a life fits to all motors together is the tail of several sums, nearer to a normal."""
+    known = load_calibration("generic", armpi)
+    learner = LifeLearner(BayesDiagnoser(known.twin, known.imperfections, whole_run=False))
+    usual = learner.model.settling
+    for together, alone in ((30.0, usual.tail_dof), (3.0, 3.0)):
+        learned = replace(known.imperfections, settling=replace(usual, tail_dof=together))
+        monkeypatch.setattr(LifeFilter, "learned", learned)
+        assert as_watched(learner.life).settling.tail_dof == alone
 
 
 def test_the_limit_of_lost_commands(armpi):

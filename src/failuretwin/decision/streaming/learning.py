@@ -69,7 +69,7 @@ class LifeLearner:
         self._worker = ThreadPoolExecutor(1, "learning")
         self._work: Future[None] | None = None
         self.movements = self._life.movements
-        self.model = self._model() if self.movements else self._life.model
+        self.model = as_watched(self._life) if self.movements else self._life.model
 
     @property
     def life(self) -> LifeFilter:
@@ -109,7 +109,7 @@ class LifeLearner:
         work, self._work = self._work, None
         try:
             work.result()
-            self.movements, self.model = self._life.movements, self._model()
+            self.movements, self.model = self._life.movements, as_watched(self._life)
         except (InputError, np.linalg.LinAlgError):
             # What was learned makes no sense. What was believed before counts on, and all begins
             # anew: a watch must not end because of what it learns.
@@ -123,13 +123,21 @@ class LifeLearner:
         life.model = replace(life.model, imperfections=_learning(now))
         life.follow(replace(run, movements=_from_zero(run.movements)))
 
-    def _model(self) -> HealthyModel:
-        """Return the robot as it is believed to be by now, with what is left of the doubt."""
-        life, learned = self._life, self._life.learned
-        _, deviation = life.offsets
-        settling = replace(life.model, imperfections=learned).settling
-        doubt = stated_variation(deviation, settling, learned.variation)
-        return replace(life.model, imperfections=replace(learned, variation=doubt))
+
+def as_watched(life: LifeFilter) -> HealthyModel:
+    """Return the robot as a life believes it to be by now, with what is left of the doubt.
+
+    A life fits one tail to all motors together. What several scatter in one movement is nearer to a
+    normal than what each does, and a watch must know how far one motor scatters by itself: its tail
+    is at least as heavy as usual of the kind.
+    """
+    learned, usual = life.learned, replace(life.model, imperfections=life.begun).settling
+    _, deviation = life.offsets
+    settling = replace(life.model, imperfections=learned).settling
+    alone = replace(settling, tail_dof=min(settling.tail_dof, usual.tail_dof))
+    doubt = stated_variation(deviation, settling, learned.variation)
+    known = replace(learned, settling=alone, variation=doubt)
+    return replace(life.model, imperfections=known)
 
 
 def _learning(now: Imperfections) -> Imperfections:

@@ -193,21 +193,31 @@ class FaultFilter:
             asked.log_healthy,
         )
 
-    def advance(self, belief: FaultBelief, seen: FaultEvidence, movement: int) -> FaultBelief:
+    def advance(
+        self,
+        belief: FaultBelief,
+        seen: FaultEvidence,
+        movement: int,
+        renewed: FloatArray | None = None,
+    ) -> FaultBelief:
         """Return what is believed after one movement more.
 
         Args:
             belief: What was believed before it.
             seen: What movements say.
             movement: Which of them.
+            renewed: Probability that the robot has been another, healthy one since the movement
+                before, (robot,); None: 0.
         """
+        same = np.ones(len(belief.healthy)) if renewed is None else 1.0 - renewed
         hours = seen.hours[:, movement, None]
         came = 1.0 - np.exp(-hours * self.rate_per_h)  # (robot, hypothesis)
         mended = 1.0 - np.exp(-hours[:, 0] * self.rates.repairs_per_1000_h / 1000.0)
-        broken = belief.held.sum(axis=1) + belief.off.sum(axis=1)
-        healthy = belief.healthy * (1.0 - came.sum(axis=1)) + mended * broken
-        begun = belief.healthy[:, None] * came
-        kept = (1.0 - mended)[:, None]
+        broken = same * (belief.held.sum(axis=1) + belief.off.sum(axis=1))
+        well = same * belief.healthy + (1.0 - same)
+        healthy = well * (1.0 - came.sum(axis=1)) + mended * broken
+        begun = well[:, None] * came
+        kept = (same * (1.0 - mended))[:, None]
         held = kept * belief.held + begun[:, self.held_of] * seen.begun[:, movement]
         off = kept * belief.off + begun[:, self._cell_of] * self._cell_share
         held = held * np.exp(np.clip(seen.held[:, movement], -MOST_NATS, MOST_NATS))

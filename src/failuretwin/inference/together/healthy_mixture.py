@@ -5,7 +5,8 @@ predictive density under it, faults and repairs included:
 
     w_c <- [ (1 - e) w_c + e / n ] p_c(movement | before),    p(h | all) = sum over c of w_c p_c(h)
 
-divided by their sum, with n candidates and e the probability that the robot has changed. So a
+divided by their sum, with n candidates and e the probability that the robot has changed. One that
+has is healthy at first: what its candidate took for a fault before says nothing of it. So a
 robot that its calibration does not fit is judged by what arms of its kind are like, and a misfit
 that lasts does not add up to a fault.
 
@@ -74,10 +75,11 @@ class HealthyMixture:
             seen: What movements say by each candidate.
             movement: Which of them.
         """
-        count = len(self.filters)
-        weight = (1.0 - CHANGED) * np.exp(belief.log_weight) + CHANGED / count
-        parts = zip(self.filters, belief.beliefs, seen, strict=True)
-        beliefs = tuple(one.advance(before, says, movement) for one, before, says in parts)
+        before = np.exp(belief.log_weight)
+        came = CHANGED / len(self.filters) * (1.0 - before)
+        weight = before * (1.0 - CHANGED + CHANGED / len(self.filters)) + came
+        parts = zip(self.filters, belief.beliefs, seen, (came / weight).T, strict=True)
+        beliefs = tuple(one.advance(held, says, movement, new) for one, held, says, new in parts)
         density = np.stack(
             [
                 says.healthy[:, movement] + after.log_predictive
