@@ -55,7 +55,8 @@ def test_onsets_of_an_arm_of_a_class_lie_in_their_intervals(stuck):
 
 
 def test_sizes_of_errors_of_an_arm_of_a_class_lie_in_their_intervals(so101):
-    assert share_inside(*judged(*so101, "steady_state_error", 12), "magnitude_90", "magnitude") > 0.65
+    found, runs = judged(*so101, "steady_state_error", 12)
+    assert share_inside(found, runs, "magnitude_90", "magnitude") > 0.65
 
 
 def test_sizes_are_as_fine_as_what_is_seen(so101):

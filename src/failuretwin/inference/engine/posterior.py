@@ -19,12 +19,15 @@ from failuretwin.core.numerics import Weighted, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.engine.filter import RowsPosterior
+from failuretwin.inference.engine.moments import Moments
 from failuretwin.inference.engine.picks import Part, Picks
+from failuretwin.inference.engine.rows import Drawn
 from failuretwin.inference.engine.runs import RunsEvidence, Weighed
 from failuretwin.inference.faults.marginal import Estimate, MarginalLikelihood
 
 LEAST_SHARE = 1e-4
-"""Picks of a run that are less probable add nothing to what is left of theta."""
+"""Picks of a run that are less probable add nothing to what is left of theta and of sizes."""
 LEAST_OUTLIER = 1e-15
 """Smallest share of the outlier: the density of a moment is told by it."""
 NORMAL_STEPS = np.linspace(-3.6, 3.6, 25)
@@ -100,8 +103,8 @@ def _onset(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) ->
 def _size(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> Weighted | None:
     rows, one = evidence.rows[h], evidence.weighed[h]
     if rows.drawn is not None:
-        drawn = [_rms(evidence, h, int(i)) for i in some]
-        mean, deviation = np.array(drawn).T
+        some, share = some[share > LEAST_SHARE], share[share > LEAST_SHARE]
+        mean, deviation = _mean_squares(evidence, h, some)
     elif rows.amount_prior is not None:
         mean, deviation = one.amount[some].T
         if _is_held(evidence.hypotheses[h]):
@@ -119,67 +122,73 @@ def _is_held(hypothesis: Hypothesis) -> bool:
     return MODES[hypothesis.faults[0].mode].signature is Signature.HELD
 
 
-def _rms(evidence: RunsEvidence, h: int, pick: int) -> tuple[float, float]:
-    """Return mean and deviation of the mean square of sizes that movements draw anew.
+def _mean_squares(evidence: RunsEvidence, h: int, some: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean and deviation of the mean square of sizes that movements draw anew, (pick,).
 
-    Movements that are not seen have the size that is expected beforehand.
+    What theta leaves open is shared by the moments. Movements that are not seen have the size that
+    is expected beforehand.
     """
-    rows, one = evidence.rows[h], evidence.weighed[h]
+    rows, one, moments = evidence.rows[h], evidence.weighed[h], evidence.scene.moments
     assert rows.drawn is not None
-    moments, run = evidence.scene.moments, int(one.picks.run[pick])
-    after = np.arange(moments.count) >= rows.first[one.picks.row[pick]]
-    share = np.where(one.found.share[pick].sum(axis=-1) > 0.0, moments.usable[run], False)
-    seen = np.flatnonzero(share & after)
-    start = moments.start[run]
-    exists = moments.ramp[run].any(axis=1)
-    hidden = exists & after & ~np.isin(start, start[seen])
-    unseen = len(np.unique(start[hidden]))
-    square, variance = _squares(evidence, h, pick, seen)
-    mean, spread = rows.drawn.square[one.picks.row[pick]]
-    count = max(len(seen) + unseen, 1)
-    return (
-        float((square.sum() + unseen * mean) / count),
-        float(np.sqrt(variance + unseen * spread) / count),
-    )
+    picks, found = one.picks[some], one.found.some(some)
+    part, run = evidence.part(h, picks), picks.run
+    after = np.arange(moments.count) >= rows.first[picks.row][:, None]
+    sized = np.where(np.isfinite(rows.drawn.size[part.kept]), found.share, 0.0)
+    seen = after & moments.usable[run] & (sized.sum(axis=-1) > 0.0)
+    powers, across = _sizes(rows.drawn, part, found, sized)
+    middle, square, fourth = np.where(seen, powers, 0.0)
+    _, theta = theta_given(part, *found.sites)
+    moved = np.einsum("pmc,pmct->pmt", np.where(seen[..., None], across, 0.0), part.columns)
+    shared = moved @ theta @ np.swapaxes(moved, -1, -2)
+    mean, spread = rows.drawn.square[picks.row].T
+    hidden = np.array([_hidden(moments, *told) for told in zip(run, after, seen, strict=True)])
+    total = np.sum(square, axis=1) + np.trace(shared, axis1=1, axis2=2) + hidden * mean
+    variance = np.sum(np.maximum(fourth - square**2, 0.0), axis=1) + hidden * spread
+    variance += 4.0 * np.einsum("pm,pmn,pn->p", middle, shared, middle)
+    count = np.maximum(seen.sum(axis=1) + hidden, 1)
+    return total / count, np.sqrt(variance) / count
 
 
-def _squares(evidence: RunsEvidence, h: int, pick: int, seen: IntArray) -> tuple[FloatArray, float]:
-    """Return the mean squared size of some moments, (moment,), and the variance of their sum.
+def _hidden(moments: Moments, run: int, after: BoolArray, seen: BoolArray) -> int:
+    """Return how many movements of a run are affected but not seen."""
+    start, exists = moments.start[run], moments.ramp[run].any(axis=1)
+    return len(np.unique(start[exists & after & ~np.isin(start, start[seen])]))
+
+
+def _sizes(
+    drawn: Drawn, part: Part, found: RowsPosterior, sized: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return means of x, x^2 and x^4 (3, pick, moment) of sizes x, and dx/df (..., channel).
 
     In the node s of width w with lever J, residual r and scale S, which holds w^2/12 J J^T,
 
         x | node ~ N(s + k J^T S^-1 r, k - k^2 J^T S^-1 J),    k = w^2 / 12
 
-    and what theta leaves open is shared by the moments.
+    Args:
+        drawn: The nodes.
+        part: The picks.
+        found: What moments say.
+        sized: Share of the outcomes that have a size, (pick, moment, outcome).
     """
-    drawn, one = evidence.rows[h].drawn, evidence.weighed[h]
-    assert drawn is not None
-    picks, found = one.picks[pick : pick + 1], one.found.some(np.array([pick]))
-    part, run = evidence.part(h, picks), int(one.picks.run[pick])
-    middle, square, fourth = np.zeros((3, len(seen)))
-    across = np.zeros((len(seen), found.mean.shape[-1]))  # moves the size by what is off in f
-    for n, m in enumerate(seen.tolist()):
-        kept = part.kept[0, m]
-        node, width, lever = drawn.size[kept], drawn.width[kept], drawn.lever[run, m, kept]
-        residual, scale = (values[0] for values in part.outcomes_at(m))
+    powers, across = np.zeros((3, *sized.shape[:2])), np.zeros_like(found.mean)
+    share = sized / np.maximum(sized.sum(axis=-1, keepdims=True), 1e-300)
+    for m in range(sized.shape[1]):
+        kept = part.kept[:, m]
+        node, width = np.nan_to_num(drawn.size[kept]), drawn.width[kept]
+        lever = drawn.lever[part.picks.run[:, None], m, kept]
+        residual, scale = part.outcomes_at(m)
         pull = np.linalg.solve(scale, lever[..., None])[..., 0]
         known = np.sum(pull * lever, axis=-1)
         within = width**2 / 12.0
-        step = within * np.sum(pull * (residual - found.mean[0, m]), axis=-1)
+        step = within * np.sum(pull * (residual - found.mean[:, None, m]), axis=-1)
         size = node + np.clip(step, -0.5 * width, 0.5 * width)
         left = np.maximum(within * (1.0 - within * known), 0.0)
-        share = np.where(np.isfinite(node), found.share[0, m], 0.0)
-        share, size = share / share.sum(), np.nan_to_num(size)
-        middle[n] = share @ size
-        square[n] = share @ (size**2 + left)
-        fourth[n] = share @ (size**4 + 6.0 * size**2 * left + 3.0 * left**2)
-        best = int(share.argmax())
-        across[n] = pull[best] / max(known[best], 1e-12)
-    _, theta = theta_given(part, *found.sites)
-    moved = np.einsum("mc,mct->mt", across, part.columns[0, seen])
-    shared = moved @ theta[0] @ moved.T
-    variance = np.sum(np.maximum(fourth - square**2, 0.0)) + 4.0 * middle @ shared @ middle
-    return square + np.diag(shared), float(variance)
+        fourth = size**4 + 6.0 * size**2 * left + 3.0 * left**2
+        for k, values in enumerate((size, size**2 + left, fourth)):
+            powers[k, :, m] = np.sum(share[:, m] * values, axis=-1)
+        best = np.arange(len(kept)), share[:, m].argmax(axis=-1)
+        across[:, m] = pull[best] / np.maximum(known[best], 1e-12)[:, None]
+    return powers, across
 
 
 def _outcome_probability(evidence: RunsEvidence, h: int, pick: int) -> FloatArray:
