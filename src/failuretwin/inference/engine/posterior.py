@@ -181,7 +181,7 @@ def _sizes(
         known = np.sum(pull * lever, axis=-1)
         within = width**2 / 12.0
         step = within * np.sum(pull * (residual - found.mean[:, None, m]), axis=-1)
-        size = node + np.clip(step, -0.5 * width, 0.5 * width)
+        size = node + np.clip(step, -width, width)
         left = np.maximum(within * (1.0 - within * known), 0.0)
         fourth = size**4 + 6.0 * size**2 * left + 3.0 * left**2
         for k, values in enumerate((size, size**2 + left, fourth)):

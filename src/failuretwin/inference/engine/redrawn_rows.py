@@ -59,6 +59,7 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
     log_prior = np.concatenate([log_of(onset[:, :1]) + log_of(shares), log_of(onset[:, 1:])], 1)
     first = np.r_[np.zeros(len(shares), dtype=np.int64), np.arange(1, count)]
     runs, rows = log_prior.shape
+    of_row = np.minimum(np.arange(rows), len(shares))
     samples, share = intervals.samples(early)
     nothing = np.zeros((runs, rows))
     return Rows(
@@ -72,12 +73,10 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
         nothing,
         nothing,
         drawn=Drawn(
-            np.r_[np.full(usual, np.nan), size, np.full(usual - 1, np.sqrt(mean_square))],
-            np.r_[np.zeros(usual), width, np.zeros(usual - 1)],
-            _levers(size, nodes.residual, usual),
-            np.stack([squares, fourths - squares**2], axis=1)[
-                np.minimum(np.arange(rows), len(shares))
-            ],
+            np.r_[np.full(usual, np.nan), size, np.zeros(usual - 1)],
+            np.r_[np.zeros(usual), width, np.full(usual - 1, np.sqrt(12.0 * mean_square))],
+            _levers(scene, motor, size, nodes.residual),
+            np.stack([squares, fourths - squares**2], axis=1)[of_row],
         ),
         onsets=sampled(samples[:, first], share[:, first]),
     )
@@ -103,21 +102,20 @@ def _nodes(scene: Scene, motor: int, size: FloatArray, width: FloatArray) -> Out
     return Outcomes.of_poses(moments, model.sensors.expected(pose), model.scatter**2, late, beside)
 
 
-def _levers(size: FloatArray, residual: FloatArray, usual: int) -> FloatArray:
+def _levers(scene: Scene, motor: int, size: FloatArray, residual: FloatArray) -> FloatArray:
     """Return what the sensors show of a size, (run, moment, outcome, channel) [m per unit].
 
     Args:
+        scene: The runs.
+        motor: Index of the motor.
         size: Of each node, (node,).
         residual: What was seen less what each node shows, (run, moment, node, channel) [m].
-        usual: Number of outcomes of the healthy robot.
     """
     half = len(size) // 2
     sides = (slice(0, half), slice(half, None))
     slopes = [-np.gradient(residual[:, :, side], size[side], axis=2) for side in sides]
-    before, after = (
-        np.zeros_like(residual[:, :, :1]).repeat(n, axis=2) for n in (usual, usual - 1)
-    )
-    return np.concatenate([before, *slopes, after], axis=2)
+    usual = scene.shown[1][..., motor] * scene.moments.done[:, :, None, None, motor]
+    return np.concatenate([usual, *slopes, usual[:, :, 1:]], axis=2)
 
 
 def _beside_losses(scene: Scene, motor: int, mean_square: float, fourth: float) -> Outcomes:

@@ -34,7 +34,7 @@ class Drawn:
 
     Attributes:
         size: Middle of the node of each outcome, (outcome,); NaN: the outcome has no size.
-        width: Width of the node, (outcome,); 0: it is counted as one size.
+        width: Width of the node, (outcome,): its variance is width^2 / 12.
         lever: What the sensors show of a size, (run, moment, outcome, channel) [m per unit].
         square: Mean and variance of the square of a size that is not seen, (row, 2).
     """
