@@ -16,6 +16,7 @@ pytest.importorskip("selenium", reason="selenium is not installed")
 pytest.importorskip("mujoco")
 from console_person import Person
 from console_server import PASSWORD, ConsoleServer
+from failuretwin.app.console.checking import HOLD_S
 from failuretwin.connection.links.base import CommandSent, Reading
 from failuretwin.connection.links.ros1 import Ros1Transport
 from failuretwin.connection.links.ros_link import RosSource
@@ -88,10 +89,14 @@ def begin(person, arm, seconds):
 
 
 def stands(arm):
-    """Return whether the arm gets no order any more, and was told to stay where it was."""
-    before = arm.hear()
+    """Return whether the arm gets no order any more, was told to stay, and does not move.
+
+    What it was told is where it was when it was last read: a moving arm is somewhat further.
+    """
+    before, was = arm.hear(), arm.angle
     same = arm.hear(QUIET_S) == before
-    return same and np.abs(arm.orders[-1].target - arm.angle).max() < 0.1
+    told_to_stay = arm.orders[-1].duration.max() <= HOLD_S
+    return same and told_to_stay and np.abs(arm.angle - was).max() < 0.02
 
 
 WATCHED, MOVED = pytest.param((), id="watched"), pytest.param(("--move",), id="moved")
