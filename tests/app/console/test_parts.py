@@ -302,6 +302,23 @@ def test_a_stopped_arm_is_told_to_stay_where_it_was_read():
         assert arm.sent[-1].target.tolist() == [0.1, 0.2]
 
 
+def test_a_check_that_is_stopped_before_it_began_sends_nothing():
+    arm = FakeArm()
+    with pytest.raises(Halted, match="stopped by ada; nothing was sent"):
+        Stoppable(arm, lambda: "stopped by ada").poll(0.1)
+    assert arm.sent == []
+
+
+def test_an_arm_whose_motors_are_not_read_is_not_told_to_stay_anywhere():
+    arm, why = FakeArm(), []
+    stoppable = Stoppable(arm, lambda: why[0] if why else "")
+    stoppable.send(Order(np.ones(2), np.ones(2)))
+    why.append("stopped by ada")
+    with pytest.raises(Halted, match="use the emergency stop"):
+        stoppable.poll(0.1)
+    assert len(arm.sent) == 1
+
+
 def test_a_check_stops_by_itself_if_the_console_hangs_or_its_page_is_gone():
     now = time.monotonic()
     late = now - HANGS_S - 1.0

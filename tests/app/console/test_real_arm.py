@@ -16,11 +16,11 @@ pytest.importorskip("selenium", reason="selenium is not installed")
 pytest.importorskip("mujoco")
 from console_person import Person
 from console_server import PASSWORD, ConsoleServer
-from failuretwin.app.console.checking import HOLD_S
 from failuretwin.connection.links.base import CommandSent, Reading
 from failuretwin.connection.links.ros1 import Ros1Transport
 from failuretwin.connection.links.ros_link import RosSource
 from failuretwin.connection.links.ros_messages import RosTopics
+from failuretwin.decision.acting.halting import HOLD_S, STANDS
 from waiting import wait_for
 
 pytestmark = [
@@ -89,10 +89,7 @@ def begin(person, arm, seconds):
 
 
 def stands(arm):
-    """Return whether the arm gets no order any more, was told to stay, and does not move.
-
-    What it was told is where it was when it was last read: a moving arm is somewhat further.
-    """
+    """Return whether the arm gets no order any more, was told to stay, and does not move."""
     before, was = arm.hear(), arm.angle
     same = arm.hear(QUIET_S) == before
     told_to_stay = arm.orders[-1].duration.max() <= HOLD_S
@@ -119,7 +116,7 @@ def test_the_stop_button_works_when_the_scripts_have_ended(person, arm):
     person.find("//button[normalize-space()='STOP']").click()
     wait_for(lambda: stands(arm))
     person.go(PAGE)
-    person.sees("stopped by ada; nothing more is sent")
+    person.sees(f"stopped by ada; {STANDS}. Nothing more is sent")
 
 
 @pytest.mark.parametrize("person", [MOVED], indirect=True)

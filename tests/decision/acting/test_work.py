@@ -24,7 +24,6 @@ from failuretwin.decision.acting.work import (
     RestWatch,
     Work,
     first_standing,
-    where_it_stands,
 )
 from failuretwin.failure_behavior.injection import ScheduledFault
 
@@ -166,8 +165,6 @@ def test_an_emulated_arm_with_a_stuck_motor(model, armpi):
 def test_where_an_arm_stands(exact):
     arm = Fake(exact)
     np.testing.assert_array_equal(first_standing(arm), np.zeros(4))
-    arm.standing = np.full(4, 0.2)
-    np.testing.assert_array_equal(where_it_stands(arm), np.full(4, 0.2))
 
 
 # Tasks from files.

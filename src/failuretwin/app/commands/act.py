@@ -121,19 +121,14 @@ def stop(place: str, topics: Path | None, robot: opt.RobotOptions) -> None:
     This is no emergency stop: the order goes through the network like any other. Keep the real one
     in reach.
     """
-    import numpy as np
-
     from failuretwin.app.arms import commander_of
-    from failuretwin.connection.links.base import Order
-    from failuretwin.decision.acting.work import where_it_stands
+    from failuretwin.decision.acting.halting import bring_to_rest
 
     if place == opt.EMULATED:
         raise InputError(f"an emulated arm ends with its process. Name {', '.join(NETWORKS)}.")
     with ExitStack() as stack:
         arm = commander_of(opt.ArmOptions(place, (), True, topics), robot.known, robot.seed, stack)
-        target = where_it_stands(arm)
-        arm.send(Order(target, np.full(len(target), 0.1)))
-        tell("told to stay where it is")
+        tell(f"told to stay where it is; {bring_to_rest(arm)}")
 
 
 @click.command()

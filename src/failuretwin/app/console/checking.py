@@ -8,20 +8,17 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from threading import Event, Thread
 
-import numpy as np
-
 from failuretwin.app.console import texts
 from failuretwin.connection.links import base
-from failuretwin.connection.links.base import Commander, Order, Reading
+from failuretwin.connection.links.base import Commander, Order
 from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.types import FloatArray
+from failuretwin.decision.acting.halting import NOT_READ, angles_of, bring_to_rest
 from failuretwin.decision.acting.work import Halted
 from failuretwin.decision.test_motions.health_check import Checking, CheckResult
 
 HANGS_S = 5.0
 """A server or page that does not beat for so long hangs, and the arm is stopped [s]."""
-HOLD_S = 0.1
-"""Duration of the order to stay [s]."""
 
 
 @dataclass
@@ -32,11 +29,13 @@ class Stoppable(Commander):
         arm: The arm.
         why: Returns why it must stop; empty: it may go on.
         position: Angles that were read last, (motor,) [rad]; None: none were.
+        moved: Whether an order was sent.
     """
 
     arm: Commander
     why: Callable[[], str]
     position: FloatArray | None = None
+    moved: bool = False
 
     @property
     def name(self) -> str:
@@ -62,31 +61,32 @@ class Stoppable(Commander):
         """Send an order, unless the arm must stop.
 
         Raises:
-            Halted: If it must.
+            Halted: If it must, as `poll` does.
         """
         self._stop_if_told()
+        self.moved = True
         self.arm.send(order)
 
     def poll(self, timeout_s: float) -> base.Event | None:
         """Return what the arm says next.
 
         Raises:
-            Halted: If the arm must stop; it is then told to stay where it is.
+            Halted: If the arm must stop; it is first told to stay where it is, until it stands.
         """
         self._stop_if_told()
         event = self.arm.poll(timeout_s)
-        if isinstance(event, Reading) and event.position is not None:
-            self.position = event.position
+        angles = angles_of(event)
+        self.position = self.position if angles is None else angles
         return event
 
     def _stop_if_told(self) -> None:
         why = self.why()
         if not why:
             return
-        place = self.position if self.position is not None else self.arm.standing
-        if place is not None and np.isfinite(place).all():
-            self.arm.send(Order(place, np.full(len(place), HOLD_S)))
-        raise Halted(f"{why}; nothing more is sent.")
+        if self.position is None and not self.moved:
+            raise Halted(f"{why}; nothing was sent.")
+        came = NOT_READ if self.position is None else bring_to_rest(self.arm, self.position)
+        raise Halted(f"{why}; {came}. Nothing more is sent.")
 
 
 @dataclass

@@ -14,20 +14,18 @@ from failuretwin.connection.links.base import Commander, CommandSent, Event, Ord
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
+from failuretwin.decision.acting.halting import FIRST_WAIT_S, POLL_S, angles_of
 from failuretwin.decision.acting.planner import Standing
 from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError
 from failuretwin.inference.observation.evidence import SETTLING_S
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
-FIRST_WAIT_S = 10.0
-"""Longest wait for the first reading, by our clock [s]."""
 PATIENCE_S = 12.0
 """A tool that has not come to rest so long after a ramp is not seen at rest, by its clock [s]."""
 SILENCE_S = 15.0
 """An arm that says nothing for so long, by our clock, is given up [s]."""
 OURS_RAD = 1e-3
 """A command that differs by more from ours is somebody else's [rad]."""
-POLL_S = 0.1
 QUIET_S = 0.5
 """Time without motion that counts as rest [s]."""
 LEAST_READINGS = 3
@@ -266,46 +264,14 @@ def first_standing(commander: Commander) -> FloatArray:
 
     Where no command has been heard, where they are read to stand.
     """
-
-    def heard(event: Event | None) -> FloatArray | None:
-        return _angles(event) if commander.standing is None else commander.standing
-
-    found = _awaited(commander, heard)
-    if found is not None:
-        return found
+    until = time.monotonic() + FIRST_WAIT_S
+    while time.monotonic() < until:
+        event = commander.poll(POLL_S)
+        found = angles_of(event) if commander.standing is None else commander.standing
+        if found is not None:
+            return found
     raise InputError(
         f"{commander.name}: neither a command nor the angles of the motors are heard within "
         f"{FIRST_WAIT_S:g} s, so it is not known where the arm stands. Move it once by hand or by "
         "its own programs, or let it publish its joint states."
     )
-
-
-def _awaited(
-    commander: Commander, pose_of: Callable[[Event | None], FloatArray | None]
-) -> FloatArray | None:
-    """Return the first pose among the next events, (motor,) [rad]; None: timed out."""
-    until = time.monotonic() + FIRST_WAIT_S
-    while time.monotonic() < until:
-        found = pose_of(commander.poll(POLL_S))
-        if found is not None:
-            return found
-    return None
-
-
-def _angles(event: Event | None) -> FloatArray | None:
-    """Return the angles that a reading tells of all motors, (motor,) [rad]; None: it does not."""
-    if not isinstance(event, Reading) or event.position is None:
-        return None
-    return event.position if np.isfinite(event.position).all() else None
-
-
-def where_it_stands(commander: Commander) -> FloatArray:
-    """Return where the motors of an arm are read to stand, (motor,) [rad], to stop it there.
-
-    Where they are not read, what they were told last.
-    """
-    found = _awaited(commander, _angles)
-    found = commander.standing if found is None else found
-    if found is not None:
-        return found
-    raise InputError(f"{commander.name}: it is not known where the arm stands; nothing was sent.")
