@@ -33,6 +33,7 @@ from failuretwin.digital_model.calibrated_robot import RobotLike
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.engine.registration import run_posterior
+from failuretwin.inference.engine.weighing import assembled
 from failuretwin.inference.explanation import worded
 from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
@@ -536,5 +537,11 @@ class StreamingFleet:
 def _as_recorded(
     likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> Posterior:
-    """Weigh hypotheses as of recorded runs, which takes too long for every sample."""
-    return run_posterior(likelihood, hypotheses, priors, in_doubt=False)
+    """Weigh hypotheses as of recorded runs, which takes too long for every sample.
+
+    Each robot has a sensor of its own.
+    """
+    robots = np.arange(len(likelihood.usable))
+    alone = (likelihood.alike(robots[k : k + 1]) for k in robots)
+    parts = [run_posterior(one, hypotheses, priors, in_doubt=False) for one in alone]
+    return assembled(likelihood, parts, robots, np.zeros_like(robots))

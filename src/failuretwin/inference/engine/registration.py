@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.engine.posterior import misfit_of, theta_factors
 from failuretwin.inference.engine.runs import has_rows
@@ -233,6 +234,11 @@ def _suspect(
 
 # The posterior of runs in chunks, each about the better of two registrations.
 
+ANOTHER_SENSOR = 0.02
+"""Probability that a run is of another sensor than the others of its set; assumed."""
+TELLS_NATS = 5.0
+"""What one run says at most against a noise of the sensor [nats]."""
+
 CHUNK_ROWS = 1600
 """Moments of all runs that are weighed at a time, times those of a run: rows grow with them, and
 columns of all rows and outcomes stay below 100 MB."""
@@ -257,7 +263,8 @@ def robot_posterior(
     if known and likelihood.moving is not None:
         pairs = zip(known, chunks, strict=True)
         parts = [one.seen_moving(likelihood.moving[rows]) for one, rows in pairs]
-    return assembled(likelihood, [one.posterior() for one in parts], *_in_turn(chunks))
+    some = [one.posterior() for one in _of_one_sensor(parts, SUSPECT_NATS)]
+    return assembled(likelihood, some, *_in_turn(chunks))
 
 
 def robot_evidence(
@@ -318,15 +325,51 @@ def _about_the_better(
     else:  # one by itself may be registered wrongly
         own = registered_each(likelihood, hypotheses, priors)
         places = [own, np.zeros_like(own)]
-    parts = [
-        displaced_weighing(likelihood[rows], hypotheses, priors, where[rows])
-        for where in places
-        for rows in _chunks(likelihood)
-    ]
+    chunks = _chunks(likelihood)
+    parts: list[Weighing] = []
+    for where in places:
+        of = [displaced_weighing(likelihood[k], hypotheses, priors, where[k]) for k in chunks]
+        parts += _of_one_sensor(of)
     if len(places) == 1:
         return parts, np.zeros(runs, dtype=np.int64)
     total = np.concatenate([one.total for one in parts]).reshape(len(places), runs)
     return parts, np.argmax(total, axis=0)
+
+
+def _of_one_sensor(parts: Sequence[Weighing], least_nats: float = -np.inf) -> Sequence[Weighing]:
+    """Return runs of one sensor, each with what the others say of its noise n.
+
+        w_c(run i) ~ w_c p(n_c | the others) / p(n_c),    p(n | the others) ~ p(n) prod p(run j | n)
+
+    With a small probability the others are of another sensor.
+
+    Args:
+        parts: The runs.
+        least_nats: Log odds of more noise than is known of the sensor, by all runs, from which they
+            tell each other.
+    """
+    components, log_weight = parts[0].components, parts[0].components.log_weight
+    levels, of = np.unique(components.noise_m, return_inverse=True)
+    own = np.eye(len(levels), dtype=bool)[of]  # (component, level)
+    prior = log_sum(np.where(own, log_weight[:, None], -np.inf), axis=0)
+    joint = np.concatenate([log_sum(one.log_evidence + one.log_odds, axis=2) for one in parts])
+    says = log_sum(np.where(own, joint[..., None], -np.inf), axis=1) - prior
+    says = np.maximum(says, says.max(axis=1, keepdims=True) - TELLS_NATS)
+    together = prior + says.sum(axis=0)
+    noisier, usual = (
+        log_sum(np.where(some, together, -np.inf), axis=0)
+        for some in (levels > levels[of[0]], levels <= levels[of[0]])
+    )
+    if not noisier - usual > least_nats:
+        return parts
+    others = together - says
+    others = others - log_sum(others, axis=1)[:, None]
+    alone = prior - log_sum(prior, axis=0)
+    shared = np.logaddexp(np.log1p(-ANOTHER_SENSOR) + others, np.log(ANOTHER_SENSOR) + alone)
+    gain = (shared - alone)[:, of]
+    ends = np.cumsum([len(one.place) for one in parts])[:-1]
+    pairs = zip(parts, np.split(gain, ends), strict=True)
+    return [one.reweighted(log_weight + more) for one, more in pairs]
 
 
 def _chunks(likelihood: RunLikelihood) -> list[IntArray]:

@@ -12,7 +12,7 @@ Section: docs/inference.md#runs
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -209,6 +209,13 @@ class RunsEvidence:
     def by_hypothesis(self) -> FloatArray:
         """Log p(run | h), (run, hypothesis)."""
         return log_sum(self.log_evidence, axis=1)
+
+    def reweighted(self, log_weight: FloatArray) -> RunsEvidence:
+        """Return the same rows by components of other weights, (run, component)."""
+        other = replace(self, components=replace(self.components, log_weight=log_weight))
+        kept = ("rows", "prepared", "left_out", "weighed")
+        vars(other).update({name: getattr(self, name) for name in kept})
+        return other
 
     def height(self, h: int) -> FloatArray:
         """Return the log of prior times evidence of all picks of a hypothesis, (pick,)."""

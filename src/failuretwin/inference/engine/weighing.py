@@ -83,6 +83,11 @@ class Weighing:
         likelihood = replace(self.likelihood, moving=moving)
         return replace(self, likelihood=likelihood, known=self.evidence)
 
+    def reweighted(self, log_weight: FloatArray) -> Weighing:
+        """Return the same runs by components of other weights, (run, component)."""
+        known = self.evidence.reweighted(log_weight)
+        return replace(self, components=known.components, known=known)
+
     @cached_property
     def log_odds(self) -> FloatArray:
         """Log prior of each hypothesis, (hypothesis,)."""
