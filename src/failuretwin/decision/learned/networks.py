@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import ConstantLR, CosineAnnealingLR
 
-from failuretwin.core.errors import unknown_name
+from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.decision.learned.feature_encoder import Floats
 
@@ -165,6 +165,25 @@ def build_network(name: str, shape: Shape) -> nn.Module:
 Batch = tuple[Floats, IntArray]
 """Standardised features (run, point, channel) and classes (run,)."""
 
+DEVICES = ("auto", "cpu", "cuda")
+"""Where networks are trained; auto: on a GPU if there is one."""
+
+
+def device_of(name: str) -> torch.device:
+    """Return a device by its name.
+
+    Raises:
+        InputError: If there is none.
+    """
+    if name not in DEVICES:
+        raise unknown_name("device", name, DEVICES)
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda: torch finds no GPU. Use --device auto or cpu.")
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(name)
+
+
 EVALUATED_RUNS = 512
 """Runs evaluated at a time."""
 
@@ -175,13 +194,14 @@ def training(
     iterations: int,
     learning_rate: float = 1e-3,
     decay: bool = False,
+    device: str = "auto",
 ) -> Iterator[int]:
-    """Train a network in place by Adam with cross-entropy loss, on a GPU if there is one.
+    """Train a network in place by Adam with cross-entropy loss.
 
-    With `decay` the learning rate falls to zero along half a cosine. Yields the number of
-    iterations after each; needs at least as many batches.
+    With `decay` the learning rate falls to zero along half a cosine; `device` is one of `DEVICES`.
+    Yields the number of iterations after each; needs at least as many batches.
     """
-    where = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    where = device_of(device)
     network.to(where)
     optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate)
     schedule = CosineAnnealingLR(optimizer, iterations) if decay else ConstantLR(optimizer, 1.0)
