@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis, single_faults
 from failuretwin.core.runs import RunTable, concatenate
+from failuretwin.core.types import IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
 from failuretwin.decision.learned.labels import Labels
 from failuretwin.decision.learned.moment_encoder import MomentEncoder, Tokens
-from failuretwin.decision.training import COUNT_RAD, RUNS_PER_CLASS, widened
+from failuretwin.decision.learned.motorwise import Batch
+from failuretwin.decision.training_data import (
+    COUNT_RAD,
+    RUNS_PER_CLASS,
+    simulated_chunks,
+    widened,
+)
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.nonidealities import Imperfections, vary
@@ -191,3 +200,59 @@ def _with_range(robot: Robot, degrees: float | None) -> Robot:
     limit = float(np.deg2rad(degrees))
     motors = (replace(first, movement_range=(max(low, -limit), min(high, limit))), *others)
     return replace(robot, profile=replace(robot.profile, motors=motors))
+
+
+# Endless batches, simulated by other processes while the network learns.
+
+CHUNK_RUNS = 576
+"""Runs of one arm simulated at a time."""
+
+
+@dataclass(frozen=True)
+class PopulationStream:
+    """Batches of simulated runs, each of one arm; they depend on `data` alone.
+
+    Attributes:
+        data: Source of the runs.
+        batch_of: Turns tokens and labels into what the network learns.
+        batch_runs: Runs in a batch.
+        uses: Number of batches that each run is part of.
+    """
+
+    data: PopulationData
+    batch_of: Callable[[Tokens, Labels], Batch]
+    batch_runs: int = 64
+    uses: int = 6
+
+    def chunks(self) -> Generator[tuple[Tokens, Labels]]:
+        """Yield chunks of new runs, one arm after the other; see `simulated_chunks`."""
+        return simulated_chunks(partial(self.data.chunk, runs=CHUNK_RUNS))
+
+    def batches(self, chunks: Iterator[tuple[Tokens, Labels]]) -> Iterator[Batch]:
+        """Yield shuffled batches of the last `uses` chunks of every arm, arms in random order."""
+        rng = np.random.default_rng([self.data.seed, CHUNK_RUNS])
+        arms, size = len(self.data.robots), self.batch_runs
+        in_use: deque[list[Batch]] = deque(maxlen=self.uses)
+        while True:
+            made = [self.batch_of(*chunk) for chunk in islice(chunks, arms)]
+            if len(made) < arms:
+                return
+            in_use.append(made)
+            known = [Batch.joined(parts) for parts in zip(*in_use, strict=True)]
+            places = [
+                (arm, runs)
+                for arm, batch in enumerate(known)
+                for runs in alike(batch.tokens.lengths, size, rng)
+            ]
+            for at in rng.permutation(len(places)).tolist():
+                arm, runs = places[at]
+                yield known[arm][runs].cut()
+
+
+def alike(lengths: IntArray, size: int, rng: np.random.Generator) -> list[IntArray]:
+    """Return the runs of full batches, in random order, each of runs of one length."""
+    found = []
+    for length in np.unique(lengths):
+        order = rng.permutation(np.flatnonzero(lengths == length))
+        found += [order[at : at + size] for at in range(0, len(order) - size + 1, size)]
+    return found

@@ -57,12 +57,14 @@ class NetworkDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     """What diagnosers by networks share: probabilities, temperature, and diagnoses in words.
 
     Attributes:
+        network_: The trained network.
         classes_: The classes.
         temperature_: Divisor of the logits before softmax.
         movements_: Smallest and largest number of movements of the training runs; None: unknown.
         weights_: Weights in the pool with the Bayesian diagnosis; None: never fitted.
     """
 
+    network_: torch.nn.Module
     classes_: NDArray[Any]
     temperature_: float
     movements_: tuple[int, int] | None

@@ -42,6 +42,8 @@ STEPS, LONGEST_RAD = 2, 0.3
 """Gauss-Newton steps from the nearest point of the circle, and the longest of them [rad]."""
 LEAST_PRECISION = 1e-2
 """Precision of a motor that does not move the tool [1/rad2]."""
+LEAST_SCATTER_RAD = 1e-4
+"""Scatter of a motor beside which turns are judged, at least [rad]."""
 LEAST_LOG = -20.0
 """Log probability of an outcome that cannot be."""
 PLAY_RAD = 0.003
@@ -82,6 +84,16 @@ class Tokens:
     def __getitem__(self, runs: NDArray[np.int64] | slice) -> Tokens:
         """Return some runs."""
         return Tokens(self.features[runs], self.exists[runs], self.anchor[runs], self.edges[runs])
+
+    @property
+    def lengths(self) -> IntArray:
+        """Moments of each run, (run,)."""
+        return np.asarray(self.exists.sum(axis=1))
+
+    def cut(self) -> Tokens:
+        """Return the same without room that no run needs."""
+        most = int(self.lengths.max(initial=1))
+        return Tokens(*(values[:, :most] for values in self.arrays))  # type: ignore[arg-type]
 
     def padded(self, moments: int) -> Tokens:
         """Return the same with room for so many moments."""
@@ -360,7 +372,7 @@ class _Encoding:
             np.clip(common_share, -1.0, 2.0),
             _compressed(mean / np.maximum(np.sqrt(rms2), 1e-6)),
             log_rms / 3.0 + 1.0,
-            log_rms - np.log(scatter),
+            log_rms - np.log(max(scatter, LEAST_SCATTER_RAD)),
         ]
         features = [*(np.where(usable, one, 0.0) for one in now), *since]
         anchor = [common.angle, common.deviation, log_rms, np.where(mean < 0.0, -1.0, 1.0)]

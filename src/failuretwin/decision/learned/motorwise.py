@@ -14,8 +14,8 @@ distributions about the size that the moments from m on point to).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -44,10 +44,6 @@ EVALUATED_RUNS = 256
 """Runs evaluated at a time."""
 
 
-class Answer(tuple[Tensor, Tensor, Tensor, Tensor]):
-    """Logit of healthy (run, 1); rows (run, moment, motor, mode); logits of bins and sizes."""
-
-
 class _Block(nn.Module):
     """Exchange over moments and motors, then two layers for each token."""
 
@@ -59,12 +55,13 @@ class _Block(nn.Module):
 
     def forward(self, x: Tensor, exists: Tensor) -> Tensor:
         """Return the tokens (run, moment, motor, width) after the exchange."""
-        known = self.norm(x) * exists[:, :, None, None]
+        there = exists[:, :, None, None]
+        known = self.norm(x) * there
         flat = known.flatten(2)  # (run, moment, motor x width)
         total = torch.cumsum(flat, dim=1)
         before = torch.unflatten(total - flat, 2, known.shape[2:]) * SUM_SCALE
         after = torch.unflatten(total[:, -1:] - total + flat, 2, known.shape[2:]) * SUM_SCALE
-        most = known.amax(dim=1, keepdim=True).expand_as(known)
+        most = (known + (1.0 - there) * NOWHERE).amax(dim=1, keepdim=True).expand_as(known)
         mean = known.mean(dim=2, keepdim=True).expand_as(known)
         largest = known.amax(dim=2, keepdim=True).expand_as(known)
         seen = torch.cat([known, before, after, most, mean, largest], dim=3)
@@ -87,9 +84,10 @@ class MotorwiseNetwork(nn.Module):
         self.rows = nn.Linear(WIDTH, modes * (1 + BINS + 3 * NORMALS))
         self.healthy = nn.Sequential(nn.Linear(3 * WIDTH, WIDTH), nn.GELU(), nn.Linear(WIDTH, 1))
 
-    def standardise(self, tokens: Tokens) -> None:
-        """Set mean and spread of the features."""
-        flat = tokens.features[tokens.exists].reshape(-1, FEATURES).astype(np.float64)
+    def standardise(self, sample: Sequence[Tokens]) -> None:
+        """Set mean and spread of the features by some runs of each arm."""
+        parts = [tokens.features[tokens.exists].reshape(-1, FEATURES) for tokens in sample]
+        flat = np.concatenate(parts).astype(np.float64)
         spread = flat.std(axis=0)
         spread[spread < 1e-3] = 1.0
         for name, values in (("mean", flat.mean(axis=0)), ("spread", spread)):
@@ -103,13 +101,14 @@ class MotorwiseNetwork(nn.Module):
         x = functional.gelu(self.embed((features - self.mean) / self.spread))
         for block in self.blocks:
             x = block(x, exists)
-        x = self.norm(x) * exists[:, :, None, None]
+        there = exists[:, :, None, None]
+        x = self.norm(x) * there
         pooled = torch.cat([x.sum(dim=1).amax(dim=1), x.sum(dim=1).mean(dim=1)], dim=1) * SUM_SCALE
-        healthy = self.healthy(torch.cat([pooled, x.amax(dim=1).amax(dim=1)], dim=1))
+        most = (x + (1.0 - there) * NOWHERE).amax(dim=(1, 2))
+        healthy = self.healthy(torch.cat([pooled, most], dim=1))
         told = torch.unflatten(self.rows(x), 3, (self.modes, 1 + BINS + 3 * NORMALS))
         row, bins, size = told.split([1, BINS, 3 * NORMALS], dim=4)
-        nowhere = (1.0 - exists[:, :, None, None]) * NOWHERE
-        return healthy, row.squeeze(4) + nowhere, bins, size
+        return healthy, row.squeeze(4) + (1.0 - there) * NOWHERE, bins, size
 
 
 def class_logits(healthy: Tensor, rows: Tensor) -> Tensor:
@@ -167,6 +166,10 @@ class Batch:
         labels = (values[runs] for values in (self.motor, self.mode, self.row, self.bin))
         return Batch(self.tokens[runs], *labels, self.size[runs], self.angle[runs])
 
+    def cut(self) -> Batch:
+        """Return the same without room that no run needs."""
+        return replace(self, tokens=self.tokens.cut())
+
     @classmethod
     def of(
         cls,
@@ -186,12 +189,19 @@ class Batch:
         z = np.where(angle, known, log_size).astype(np.float32)
         return cls(tokens, motor, mode, row, place, z, angle)
 
+    @classmethod
+    def joined(cls, parts: Sequence[Batch]) -> Batch:
+        """Return the runs of several batches of one arm."""
+        tokens = Tokens.joined([part.tokens for part in parts])
+        names = ("motor", "mode", "row", "bin", "size", "angle")
+        return cls(tokens, *(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+
 
 def onset_bins(tokens: Tokens, motor: IntArray, onset: FloatArray) -> tuple[IntArray, IntArray]:
     """Return the row and the bin of the onset of each run, (run,) each."""
     runs = np.arange(len(tokens))
     edges = tokens.edges[runs, :, motor].astype(np.float64)  # (run, moment, bin + 1)
-    late = edges[..., -1] <= onset[:, None]
+    late = tokens.exists & (edges[..., -1] <= onset[:, None])
     row = np.minimum(late.sum(axis=1), tokens.exists.sum(axis=1) - 1)
     row = np.where(onset <= 0.0, 0, row)
     inside = (edges[runs, row, 1:] <= onset[:, None]).sum(axis=1)

@@ -38,7 +38,7 @@ from failuretwin.decision.learned.motorwise import (
 )
 from failuretwin.decision.learned.networks import device_of
 from failuretwin.digital_model.robot import Robot
-from failuretwin.failure_behavior.mode import FaultMode, Signature
+from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class MotorwiseDiagnoser(NetworkDiagnoser):
         rng = np.random.default_rng(check_random_state(self.random_state).randint(2**31))
         batches = _shuffled(self.batch_of(tokens, labels), self.batch_runs, rng)
         movements = int(counts.min()), int(counts.max())
-        return self.fit_batches(batches, tokens, movements, [encoder.robot.name])
+        return self.fit_batches(batches, [tokens], movements, [encoder.robot.name])
 
     def batch_of(self, tokens: Tokens, labels: Labels) -> Batch:
         """Return runs with their truth as the network learns them."""
@@ -106,7 +106,7 @@ class MotorwiseDiagnoser(NetworkDiagnoser):
     def fit_batches(
         self,
         batches: Iterable[Batch],
-        sample: Tokens,
+        sample: Sequence[Tokens],
         movements: tuple[int, int],
         arms: Sequence[str],
         on_iteration: Callable[[int], None] = lambda done: None,
@@ -116,7 +116,7 @@ class MotorwiseDiagnoser(NetworkDiagnoser):
 
         Args:
             batches: The runs.
-            sample: Some of them, by which features are standardised.
+            sample: Runs of each robot by which features are standardised.
             movements: Smallest and largest number of movements of a run.
             arms: Names of the robots.
             on_iteration: Called after each batch with the number of batches so far.
@@ -170,6 +170,13 @@ class MotorwiseDiagnoser(NetworkDiagnoser):
             raise InputError("this network has no encoder, so it knows no robot: give it one.")
         return self.encoder
 
+    def _unfamiliar(self, movements: int) -> tuple[str, ...]:
+        remarks = super()._unfamiliar(movements)
+        if self.known_robot.name in self.arms_:
+            return remarks
+        known = ", ".join(self.arms_)
+        return (*remarks, f"the network learned from other arms ({known}): check it on this one")
+
     def scores(self, X: Runs | Tokens) -> FloatArray:
         """Return the logits, (run, class), before the temperature."""
         check_is_fitted(self, "network_")
@@ -215,21 +222,15 @@ class MotorwiseDiagnoser(NetworkDiagnoser):
         name = self.modes[number]
         share, centre, deviation = size_mixture(told, tokens, run, motor, number, is_angle(name))
         found = mixture_quantiles(share, centre, deviation)
-        if is_angle(name):
-            return tuple(found)
-        found = np.exp(found)
-        negative = is_signed(MODES[name]) and tokens.anchor[run, 0, motor, 3] < 0.0
-        return tuple((-found[::-1]) if negative else found)
+        if not is_angle(name):
+            negative = MODES[name].signed and tokens.anchor[run, 0, motor, 3] < 0.0
+            found = -np.exp(found)[::-1] if negative else np.exp(found)
+        return tuple(found.tolist())
 
 
 def is_angle(mode: str) -> bool:
     """Return whether the size of a mode is the angle at which the motor is held."""
     return MODES[mode].signature is Signature.HELD
-
-
-def is_signed(mode: FaultMode) -> bool:
-    """Return whether sizes of a mode have a sign."""
-    return mode.signed and mode.signature is not Signature.REDRAWN_OFFSET
 
 
 def check_modes(hypotheses: Sequence[Hypothesis | str], robot: Robot) -> tuple[str, ...]:
