@@ -249,7 +249,7 @@ def test_every_run_of_every_arm_is_used_as_often_as_asked():
     data = PopulationData(robots, PAPER_MODES, 3)
     network = MotorwiseDiagnoser(MomentEncoder(robots[0].robot, robots[0].imperfections))
     chunks = [data.chunk(number, 18) for number in range(6)]
-    stream = PopulationStream(data, network.batch_of, batch_runs=6, uses=2)
+    stream = PopulationStream(data, network.batch_of, batch_runs=2, uses=2)
     seen = [batch.size[batch.mode >= 0] for batch in stream.batches(iter(chunks))]
     for number, (_, labels) in enumerate(chunks):
         size = labels.size[labels.mode == 1]

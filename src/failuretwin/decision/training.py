@@ -181,7 +181,8 @@ def _motorwise(
     exams = [
         _Exam(
             BayesDiagnoser(arm, hypotheses=[*map(str, network.for_robot(encoder).classes_)]),
-            *(other.run_set(at + part * len(robots), half) for part in range(2)),
+            other.run_set(at, half),
+            other.run_set(at + len(robots), half),
             encoder,
         )
         for at, arm in enumerate(robots)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from failuretwin.core.numerics import log_fall, log_norm
-from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
@@ -111,7 +111,7 @@ class Tokens:
         """Return the runs of several sets, the shorter ones padded."""
         most = max(part.exists.shape[1] for part in parts)
         columns = zip(*(part.padded(most).arrays for part in parts), strict=True)
-        return cls(*(np.concatenate(column) for column in columns))  # type: ignore[arg-type]
+        return cls(*(np.concatenate(column) for column in columns))
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class _Encoding:
         """Return S^-1 and log det S."""
         S = (jacobian * variance[..., None, :]) @ np.swapaxes(jacobian, -1, -2)
         S = S + self.model.path_noise**2 * np.eye(S.shape[-1])
-        return np.linalg.inv(S), np.asarray(np.linalg.slogdet(S)[1])
+        return as_floats(np.linalg.inv(S)), as_floats(np.linalg.slogdet(S)[1])
 
     def _log_density(self, square: FloatArray, log_det: FloatArray) -> FloatArray:
         dof, dims = self.model.settling.tail_dof, self.moments.point.shape[-1]

@@ -27,6 +27,7 @@ from torch.optim.lr_scheduler import OneCycleLR
 
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.decision.learned.moment_encoder import BINS, FEATURES, Tokens
+from failuretwin.decision.learned.networks import DROPOUT
 
 WIDTH, BLOCKS = 48, 3
 """Features of a token inside the network, and blocks that exchange them."""
@@ -51,6 +52,7 @@ class _Block(nn.Module):
         super().__init__()
         self.norm = nn.LayerNorm(width)
         self.mixed = nn.Linear(6 * width, 2 * width)
+        self.dropout = nn.Dropout(DROPOUT)
         self.out = nn.Linear(2 * width, width)
 
     def forward(self, x: Tensor, exists: Tensor) -> Tensor:
@@ -65,7 +67,7 @@ class _Block(nn.Module):
         mean = known.mean(dim=2, keepdim=True).expand_as(known)
         largest = known.amax(dim=2, keepdim=True).expand_as(known)
         seen = torch.cat([known, before, after, most, mean, largest], dim=3)
-        return x + self.out(functional.gelu(self.mixed(seen)))
+        return x + self.out(self.dropout(functional.gelu(self.mixed(seen))))
 
 
 class MotorwiseNetwork(nn.Module):
@@ -107,7 +109,7 @@ class MotorwiseNetwork(nn.Module):
         most = (x + (1.0 - there) * NOWHERE).amax(dim=(1, 2))
         healthy = self.healthy(torch.cat([pooled, most], dim=1))
         told = torch.unflatten(self.rows(x), 3, (self.modes, 1 + BINS + 3 * NORMALS))
-        row, bins, size = told.split([1, BINS, 3 * NORMALS], dim=4)
+        row, bins, size = torch.split(told, [1, BINS, 3 * NORMALS], dim=4)
         return healthy, row.squeeze(4) + (1.0 - there) * NOWHERE, bins, size
 
 
@@ -163,8 +165,9 @@ class Batch:
 
     def __getitem__(self, runs: IntArray | slice) -> Batch:
         """Return some runs."""
-        labels = (values[runs] for values in (self.motor, self.mode, self.row, self.bin))
-        return Batch(self.tokens[runs], *labels, self.size[runs], self.angle[runs])
+        motor, mode, row, place = (v[runs] for v in (self.motor, self.mode, self.row, self.bin))
+        size, angle = self.size[runs], self.angle[runs]
+        return Batch(self.tokens[runs], motor, mode, row, place, size, angle)
 
     def cut(self) -> Batch:
         """Return the same without room that no run needs."""

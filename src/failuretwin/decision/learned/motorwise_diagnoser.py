@@ -179,8 +179,12 @@ class MotorwiseDiagnoser(NetworkDiagnoser):
 
     def scores(self, X: Runs | Tokens) -> FloatArray:
         """Return the logits, (run, class), before the temperature."""
+        return self._told(self._tokens(X)).scores
+
+    def _told(self, tokens: Tokens) -> Told:
         check_is_fitted(self, "network_")
-        return told_of(self.network_, self._tokens(X)).scores
+        assert isinstance(self.network_, MotorwiseNetwork)
+        return told_of(self.network_, tokens)
 
     def _tokens(self, X: Runs | Tokens) -> Tokens:
         if isinstance(X, Tokens):
@@ -193,7 +197,7 @@ class MotorwiseDiagnoser(NetworkDiagnoser):
 
     def _answers(self, runs: xr.Dataset) -> tuple[FloatArray, Sequence[Estimate]]:
         tokens = self._tokens(runs)
-        told = told_of(self.network_, tokens)
+        told = self._told(tokens)
         best = told.scores.argmax(axis=1)
         estimates = [self._estimate(told, tokens, *pair) for pair in enumerate(best.tolist())]
         chances = torch.from_numpy(told.scores / self.temperature_).softmax(1).numpy()
