@@ -20,6 +20,7 @@ from failuretwin.decision.learned.motorwise import onset_bins
 from failuretwin.decision.learned.motorwise_diagnoser import (
     MotorwiseDiagnoser,
     check_modes,
+    conformal_spread,
     mixture_quantiles,
 )
 from failuretwin.decision.learned.networks import device_of
@@ -297,3 +298,11 @@ def test_intervals_hold_as_often_as_they_say(population):
 def test_it_is_nearly_as_good_as_its_teacher_soon(population):
     network, exam = population
     assert network.score(exam) > 0.85
+
+
+def test_sizes_are_widened_until_their_intervals_hold():
+    """Deviations that are half of what they should be."""
+    rng = np.random.default_rng(0)
+    one = np.ones(1)
+    held = [(float(x), one, 0.0 * one, 0.5 * one) for x in rng.standard_normal(4000)]
+    assert conformal_spread(held) == pytest.approx(2.0, rel=0.08)

@@ -18,8 +18,9 @@ from failuretwin.decision.learned.diagnoser import (
     best_temperature,
 )
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of
+from failuretwin.decision.learned.labels import Labels
 from failuretwin.decision.learned.log_pool import HybridDiagnoser, fit_pool_weights
-from failuretwin.decision.learned.moment_encoder import MomentEncoder
+from failuretwin.decision.learned.moment_encoder import MomentEncoder, Tokens
 from failuretwin.decision.learned.motorwise_diagnoser import (
     NETWORK,
     MotorwiseDiagnoser,
@@ -140,6 +141,14 @@ class _Exam:
             return network
         return network.for_robot(self.encoder)
 
+    def labelled(self, network: MotorwiseDiagnoser) -> tuple[Tokens, Labels]:
+        """Return tokens and truth of the runs to fit."""
+        assert self.encoder is not None
+        faults = [str(name) for name in self.runs["fault"].values]
+        names = self.encoder.robot.motor_names
+        labels = Labels.of_runs(self.runs, faults, names, network.modes)
+        return self.encoder.encode(self.runs), labels
+
     def judged(self, network: NetworkDiagnoser) -> tuple[Scores, Scores]:
         """Return the scores of the network and of its pool with the Bayesian diagnosis."""
         kind = class_name(self.bayes.twin.robot)
@@ -230,6 +239,8 @@ def _calibrate(network: NetworkDiagnoser, exams: Sequence[_Exam]) -> None:
     truth = np.concatenate([_truth(exam.of(network), exam.runs) for exam in exams])
     scores = [exam.of(network).scores(exam.runs) for exam in exams]
     network.temperature_ = best_temperature(_joined(scores, NEVER), truth)
+    if isinstance(network, MotorwiseDiagnoser):
+        network.calibrate_sizes([exam.labelled(network) for exam in exams])
     by_network = [exam.of(network).predict_proba(exam.runs) for exam in exams]
     by_bayes = []
     for exam in exams:

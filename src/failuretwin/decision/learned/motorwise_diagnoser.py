@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
@@ -73,6 +74,7 @@ class MotorwiseDiagnoser(NetworkDiagnoser):
         network_: The trained network.
         temperature_: Divisor of the logits before softmax.
         movements_: Smallest and largest number of movements of the training runs.
+        spread_: Factor on the deviations of sizes, by mode.
         arms_: Names of the robots of the training runs.
         weights_: Weights in the pool with the Bayesian diagnosis; None: never fitted.
     """
@@ -136,9 +138,37 @@ class MotorwiseDiagnoser(NetworkDiagnoser):
                 on_iteration(done)
         self.network_ = network.cpu()
         self.temperature_, self.weights_ = 1.0, None
+        self.spread_ = (1.0,) * len(self.modes)
         self.movements_, self.arms_ = movements, tuple(arms)
         self.classes_ = self._class_names()
         return self
+
+    def calibrate_sizes(self, exams: Sequence[tuple[Tokens, Labels]]) -> MotorwiseDiagnoser:
+        """Widen or narrow sizes until 90 % intervals hold 90 % of held-out runs; no test set.
+
+        Args:
+            exams: Tokens and truth of runs of each robot.
+        """
+        spread = []
+        for number in range(len(self.modes)):
+            known = [self._sizes(tokens, labels, number) for tokens, labels in exams]
+            held = [one for some in known for one in some]
+            spread.append(conformal_spread(held) if held else 1.0)
+        self.spread_ = tuple(spread)
+        return self
+
+    def _sizes(
+        self, tokens: Tokens, labels: Labels, number: int
+    ) -> list[tuple[float, FloatArray, FloatArray, FloatArray]]:
+        """Return true size and its mixture of the runs with a fault of one mode."""
+        told, angle = self._told(tokens), is_angle(self.modes[number])
+        found = []
+        for run in np.flatnonzero(labels.mode == number).tolist():
+            size = labels.size[run] if angle else np.log(max(abs(labels.size[run]), 1e-9))
+            motor = int(labels.motor[run])
+            mixture = size_mixture(told, tokens, run, motor, number, angle)
+            found.append((float(size), *mixture))
+        return found
 
     def for_robot(self, encoder: MomentEncoder) -> MotorwiseDiagnoser:
         """Return the same network for the runs of another robot, or by another calibration."""
@@ -225,7 +255,7 @@ class MotorwiseDiagnoser(NetworkDiagnoser):
         """Return the quantiles of the size of a fault, by `QUANTILES`."""
         name = self.modes[number]
         share, centre, deviation = size_mixture(told, tokens, run, motor, number, is_angle(name))
-        found = mixture_quantiles(share, centre, deviation)
+        found = mixture_quantiles(share, centre, self.spread_[number] * deviation)
         if not is_angle(name):
             negative = MODES[name].signed and tokens.anchor[run, 0, motor, 3] < 0.0
             found = -np.exp(found)[::-1] if negative else np.exp(found)
@@ -298,10 +328,29 @@ def size_mixture(
     return share.ravel(), (middle[:, None] + scale[:, None] * centre).ravel(), deviation.ravel()
 
 
+SPREADS = np.geomspace(0.5, 4.0, 61)
+"""Factors on deviations of sizes that are tried."""
+
+
+def conformal_spread(
+    held: Sequence[tuple[float, FloatArray, FloatArray, FloatArray]],
+) -> float:
+    """Return the least factor on deviations with which intervals hold as often as they say.
+
+    Args:
+        held: True size, and share, mean and deviation of the normal distributions, of some runs.
+    """
+    low, _, high = QUANTILES
+    for factor in SPREADS.tolist():
+        below = [float(s @ ndtr((x - m) / (factor * d))) for x, s, m, d in held]
+        inside = np.mean([low <= one <= high for one in below])
+        if inside >= high - low:
+            return float(factor)
+    return float(SPREADS[-1])
+
+
 def mixture_quantiles(share: FloatArray, mean: FloatArray, deviation: FloatArray) -> FloatArray:
     """Return the quantiles of a sum of normal distributions, by `QUANTILES`."""
-    from scipy.special import ndtr
-
     wanted = np.array(QUANTILES)
     low = np.full(len(wanted), np.min(mean - FURTHEST * deviation))
     high = np.full(len(wanted), np.max(mean + FURTHEST * deviation))

@@ -98,6 +98,7 @@ def _motorwise(diagnoser: MotorwiseDiagnoser) -> dict[str, Any]:
     return {
         "network": NETWORK,
         "arms": diagnoser.arms_,
+        "spread": diagnoser.spread_,
         "robot": encoder.robot.name,
         "arm_sha256": arm_fingerprint(encoder.robot),
         "imperfections": asdict(encoder.imperfections),
@@ -218,6 +219,7 @@ def _restored_motorwise(
     network = MotorwiseNetwork(len(modes))
     network.load_state_dict(tensors)
     diagnoser.network_ = network
+    diagnoser.spread_ = tuple(float(factor) for factor in configuration["spread"])
     diagnoser.arms_ = tuple(str(name) for name in configuration["arms"])
     return diagnoser.for_robot(encoder)
 
