@@ -26,7 +26,8 @@ from torch.nn import functional
 from torch.optim.lr_scheduler import OneCycleLR
 
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.decision.learned.moment_encoder import BINS, FEATURES, Tokens
+from failuretwin.decision.learned.moment_encoder import BINS, Tokens
+from failuretwin.decision.learned.moment_features import FEATURES
 from failuretwin.decision.learned.networks import DROPOUT
 
 WIDTH, BLOCKS = 48, 3

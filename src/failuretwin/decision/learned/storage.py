@@ -30,7 +30,8 @@ from failuretwin.decision.learned.diagnoser import (
 )
 from failuretwin.decision.learned.feature_encoder import POINTS, Expectation, FeatureEncoder
 from failuretwin.decision.learned.log_pool import PoolWeights
-from failuretwin.decision.learned.moment_encoder import FEATURES, MomentEncoder
+from failuretwin.decision.learned.moment_encoder import MomentEncoder
+from failuretwin.decision.learned.moment_features import FEATURES
 from failuretwin.decision.learned.motorwise import MotorwiseNetwork, class_logits
 from failuretwin.decision.learned.motorwise_diagnoser import NETWORK, MotorwiseDiagnoser
 from failuretwin.decision.learned.networks import Standard, build_network
