@@ -306,3 +306,10 @@ def test_sizes_are_widened_until_their_intervals_hold():
     one = np.ones(1)
     held = [(float(x), one, 0.0 * one, 0.5 * one) for x in rng.standard_normal(4000)]
     assert conformal_spread(held) == pytest.approx(2.0, rel=0.08)
+
+
+def test_runs_of_an_unknown_kind_are_told(runs, trained):
+    """Half of the movements: the network says something, and that it means little."""
+    short = runs.isel(run=[0], time=slice(0, 450))[["command", "measured"]]
+    (diagnosis,) = trained.diagnose(short)
+    assert any("learned from runs of 5" in remark for remark in diagnosis.quality)

@@ -222,7 +222,7 @@ class PopulationStream:
     data: PopulationData
     batch_of: Callable[[Tokens, Labels], Batch]
     batch_runs: int = 64
-    uses: int = 6
+    uses: int = 4
 
     def chunks(self) -> Generator[tuple[Tokens, Labels]]:
         """Yield chunks of new runs, one arm after the other; see `simulated_chunks`."""

@@ -128,17 +128,17 @@ class NetworkDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         check_runs(runs, "the run set")
         check_motors(runs, robot.name, robot.motor_names)
         quality = log_quality(runs, settings=InferenceSettings.of(robot))
-        chances, estimates = self._answers(drop_invalid(runs, quality))
+        chances, estimates, counts = self._answers(drop_invalid(runs, quality))
         names, faults = runs["run"].values.tolist(), truth_of(runs)
         truth: Sequence[str | None] = [None] * len(names) if faults is None else faults
-        counts = movement_counts(runs).tolist()
-        rows = zip(names, truth, chances.tolist(), estimates, quality, counts, strict=True)
+        said = chances.tolist(), estimates
+        rows = zip(names, truth, *said, quality, counts.tolist(), strict=True)
         return [self._diagnosis(*row) for row in rows]
 
-    def _answers(self, runs: xr.Dataset) -> tuple[FloatArray, Sequence[Estimate]]:
-        """Return the probabilities (run, class), and onset and size of the likeliest fault."""
+    def _answers(self, runs: xr.Dataset) -> tuple[FloatArray, Sequence[Estimate], IntArray]:
+        """Return probabilities (run, class), the likeliest fault's onset and size, movements."""
         chances = self.predict_proba(runs)
-        return chances, [{}] * len(chances)
+        return chances, [{}] * len(chances), movement_counts(runs)
 
     def _diagnosis(
         self,

@@ -225,13 +225,13 @@ class MotorwiseDiagnoser(NetworkDiagnoser):
         encode = self.coder.encode
         return Tokens.joined([encode(X.isel(run=slice(at, at + PART_RUNS))) for at in parts])
 
-    def _answers(self, runs: xr.Dataset) -> tuple[FloatArray, Sequence[Estimate]]:
+    def _answers(self, runs: xr.Dataset) -> tuple[FloatArray, Sequence[Estimate], IntArray]:
         tokens = self._tokens(runs)
         told = self._told(tokens)
         best = told.scores.argmax(axis=1)
         estimates = [self._estimate(told, tokens, *pair) for pair in enumerate(best.tolist())]
         chances = torch.from_numpy(told.scores / self.temperature_).softmax(1).numpy()
-        return chances, estimates
+        return chances, estimates, tokens.lengths  # many of a run that never rests
 
     def _estimate(self, told: Told, tokens: Tokens, run: int, best: int) -> Estimate:
         """Return onset and size of the likeliest fault of a run."""
