@@ -28,7 +28,7 @@ from failuretwin.decision.learned.networks import (
     training,
 )
 from failuretwin.decision.learned.storage import export_onnx
-from failuretwin.decision.training import CHUNK_RUNS, Stream, TrainingData
+from failuretwin.decision.training_data import CHUNK_RUNS, Stream, TrainingData
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
 PAPER_ITERATIONS, PAPER_JOBS = 5050, 20

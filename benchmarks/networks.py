@@ -1,7 +1,9 @@
-"""Networks side by side: same runs, same features, same iterations, several seeds.
+"""Networks side by side: same runs, same iterations, several seeds.
 
 Trains what is missing in a folder and scores everything there on simulated runs of the physics
-engine. With --real, also on real runs: that is a look at them, and belongs into looks.md.
+engine. With --arms, one motor-wise network for the four bundled arms is scored on each of them,
+beside Bayes. With --real, all are scored on real runs: that is a look at them, and belongs into
+looks.md.
 """
 
 from __future__ import annotations
@@ -11,39 +13,47 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 
 from failuretwin import BayesDiagnoser, DigitalTwin, Plan, ReadOptions, load_robot, read_runs
 from failuretwin.core.hypothesis import Diagnosis, paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generate import simulate
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
+from failuretwin.decision.learned.motorwise_diagnoser import NETWORK
 from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import load_network, save_network
+from failuretwin.decision.motorwise_data import PopulationData
 from failuretwin.decision.scoring import (
     log_score,
     log_score_gain,
     mcnemar,
     reliability,
 )
-from failuretwin.decision.training import TrainingPlan, train_network
-from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.digital_model.robot import Robot
+from failuretwin.decision.training import ARMS, TrainingPlan, train_network
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot, calibrated
+from failuretwin.failure_behavior.registry import MODES
 
 PER_CLASS = 223
 """Runs of each class by the physics engine: 2007 in all."""
+POPULATION_RUNS, POPULATION_SEED = 600, 700_001
+"""Runs of each arm by the physics engine, of faults of any onset, and their seed."""
+KINDS = (NETWORK, "all_arms", *NETWORKS)
+"""What is trained; all_arms: the motor-wise network for four arms."""
 
 
-def train_missing(folder: Path, robot: Robot, seeds: int, iterations: int) -> None:
+def train_missing(
+    folder: Path, known: CalibratedRobot, kinds: Sequence[str], seeds: int, iterations: int
+) -> None:
     """Train every network for every seed that has no file yet."""
     folder.mkdir(parents=True, exist_ok=True)
-    imperfections = load_calibration(robot.name, robot).imperfections
     for seed in range(seeds):
-        for name in NETWORKS:
+        for name in kinds:
             path = folder / f"{name}_{seed}.npz"
             if not path.exists():
-                diagnoser, found, _ = train_network(
-                    TrainingPlan(name, iterations, seed), robot, imperfections
-                )
+                every = name == "all_arms"
+                plan = TrainingPlan(NETWORK if every else name, iterations, seed, all_arms=every)
+                diagnoser, found, _ = train_network(plan, known)
                 save_network(diagnoser, path)
                 said = f"{found.accuracy:.4f} right, {found.log_score:.4f} nats a run"
                 print(f"{name} seed {seed}: {said}", flush=True)
@@ -70,7 +80,7 @@ def print_networks(said: Mapping[str, Sequence[Diagnosis]], what: str) -> None:
     rows = {name: judged(diagnoses) for name, diagnoses in said.items()}
     for name, (right, nats, error) in rows.items():
         print(f"{name:16s}{100 * right:8.1f} %{nats:8.3f}{error:8.3f}")
-    for kind in NETWORKS:
+    for kind in KINDS:
         mine = np.array([row for name, row in rows.items() if name.startswith(f"{kind}_")])
         if len(mine):
             (right, nats, error), spread = mine.mean(axis=0), mine[:, 0].std(ddof=len(mine) > 1)
@@ -78,6 +88,41 @@ def print_networks(said: Mapping[str, Sequence[Diagnosis]], what: str) -> None:
                 f"{kind:16s}{100 * right:8.1f} %{nats:8.3f}{error:8.3f}   mean of {len(mine)} "
                 f"seeds, sd {100 * spread:.1f} %"
             )
+
+
+def intervals(diagnoses: Sequence[Diagnosis], runs: xr.Dataset) -> str:
+    """Return how often the 90 % intervals of faults that were named rightly hold the truth."""
+    truths = {"onset_90": runs["onset"].values, "magnitude_90": runs["magnitude"].values}
+    said = []
+    for mode, what in (("stuck", "held angle"), ("steady_state_error", "size")):
+        some = [
+            i
+            for i, d in enumerate(diagnoses)
+            if d.diagnosis == d.truth and str(d.truth).endswith(mode)
+        ]
+        for name, words in (("onset_90", "onset"), ("magnitude_90", what)):
+            ends = [getattr(diagnoses[i], name) for i in some]
+            pairs = [(e, truths[name][i]) for e, i in zip(ends, some, strict=True) if e is not None]
+            held = sum(low - 1e-9 <= value <= high + 1e-9 for (low, high), value in pairs)
+            said.append(f"{mode} {words} {held} of {len(pairs)}")
+    return "; ".join(said)
+
+
+def print_arms(folder: Path) -> None:
+    """Print the networks for all arms beside Bayes, and beside those of one arm, on each arm."""
+    modes = {name: MODES[name] for name in ("stuck", "steady_state_error")}
+    for arm in ARMS:
+        known = calibrated(arm)
+        data = PopulationData((known,), modes, POPULATION_SEED, "physics", exact=True)
+        runs = data.run_set(0, POPULATION_RUNS)
+        files = [*folder.glob("all_arms_*.npz"), *folder.glob(f"{arm}_*.npz")]
+        if arm == "armpi_fpv":
+            files += folder.glob(f"{NETWORK}_*.npz")
+        said = {path.stem: load_network(path, known).diagnose(runs) for path in sorted(files)}
+        said = {"bayes": BayesDiagnoser(known).diagnose(runs), **said}
+        print_networks(said, f"{POPULATION_RUNS} runs of {arm}, faults of any onset")
+        for name, diagnoses in said.items():
+            print(f"{name}: {intervals(diagnoses, runs)}")
 
 
 def compare(first: Sequence[Diagnosis], second: Sequence[Diagnosis], words: str) -> None:
@@ -98,17 +143,22 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="where the networks are kept")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--iterations", type=int, default=6000)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--arms", action="store_true", help="score each bundled arm and end")
     parser.add_argument("--real", type=Path, help="real runs whose folders end in _label_K")
     arguments = parser.parse_args()
     robot = load_robot("armpi_fpv")
-    imperfections = load_calibration(robot.name, robot).imperfections
-    train_missing(arguments.folder, robot, arguments.seeds, arguments.iterations)
-    networks = {
-        path.stem: load_network(path, robot) for path in sorted(arguments.folder.glob("*.npz"))
-    }
+    known = calibrated(robot)
+    train_missing(arguments.folder, known, arguments.kinds, arguments.seeds, arguments.iterations)
+    if arguments.arms:
+        print_arms(arguments.folder)
+        return
+    files = [path for kind in KINDS for path in sorted(arguments.folder.glob(f"{kind}_*.npz"))]
+    networks = {path.stem: load_network(path, robot) for path in files}
     bayes = BayesDiagnoser(DigitalTwin(robot))
     hypotheses = paper_hypotheses(robot.motor_names)
-    plan = Plan(robot, hypotheses, PER_CLASS, 500_002, imperfections, engine="physics")
+    figures = known.imperfections
+    plan = Plan(robot, hypotheses, PER_CLASS, 500_002, figures, engine="physics")
     sets = {f"{plan.size} runs of the physics engine": simulate(plan)}
     if arguments.real is not None:
         options = ReadOptions(published_labels=True)
@@ -118,6 +168,8 @@ def main() -> None:
         said = {name: network.diagnose(runs) for name, network in networks.items()}
         model = bayes.diagnose(runs)
         print_networks({"bayes": model, **said}, what)
+        for name, diagnoses in {"bayes": model, **said}.items():
+            print(f"{name}: {intervals(diagnoses, runs)}")
         for name, network in networks.items():
             for form, weight in (("blended", network.weights_), ("gated", None)):
                 both = HybridDiagnoser(bayes, network, weight).diagnose(runs)

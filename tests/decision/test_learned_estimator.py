@@ -13,11 +13,11 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.decision import training as stream_module
+from failuretwin.decision import training_data as stream_module
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser, best_temperature
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of, signals_of
 from failuretwin.decision.learned.networks import Standard
-from failuretwin.decision.training import CHUNK_RUNS, Stream, TrainingData
+from failuretwin.decision.training_data import CHUNK_RUNS, Stream, TrainingData
 from user_modes import code_on_the_page, registered_from
 
 

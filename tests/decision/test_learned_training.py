@@ -8,7 +8,7 @@ from failuretwin.app.commands.learn import train as command
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.decision import training as stream_module
+from failuretwin.decision import motorwise_data as stream_module
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.decision.learned.networks import (
@@ -20,7 +20,8 @@ from failuretwin.decision.learned.networks import (
     shuffled_batches,
     training,
 )
-from failuretwin.decision.training import VARIANTS, TrainingData, TrainingPlan, train, widened
+from failuretwin.decision.training import TrainingPlan, train
+from failuretwin.decision.training_data import VARIANTS, TrainingData, widened
 
 SHAPE = Shape(channels=10, classes=3, motors=2, shared=2)
 ALL = pytest.mark.parametrize("name", list(NETWORKS))
@@ -180,5 +181,5 @@ def test_a_network_is_trained_and_pooled_with_bayes_in_one_call(armpi, measured_
 
 def test_the_command_trains_as_much_as_python_does():
     given = {option.name: option.default for option in command.params}
-    assert (given["network"], given["iterations"]) == ("cnn", 6000)
-    assert (TrainingPlan().network, TrainingPlan().iterations) == ("cnn", 6000)
+    assert (given["network"], given["iterations"]) == ("motorwise", 6000)
+    assert (TrainingPlan().network, TrainingPlan().iterations) == ("motorwise", 6000)

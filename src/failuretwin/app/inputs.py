@@ -23,6 +23,7 @@ from failuretwin.data_knowledge.store import write_text
 from failuretwin.data_knowledge.workers import ONE_PROCESS, Workforce
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, class_name
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot, calibrated
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.registry import MODES
@@ -35,7 +36,7 @@ from failuretwin.inference.set_ups.log_correction import CorrectionTable, LogCor
 if TYPE_CHECKING:
     import xarray as xr
 
-    from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
+    from failuretwin.decision.learned.diagnoser import NetworkDiagnoser
 
 
 def read_inputs(
@@ -217,11 +218,19 @@ def chosen_diagnoser(method: str, bayes: BayesDiagnoser) -> Diagnoser:
     check_learning()
     from failuretwin.decision.learned.storage import load_network
 
-    network = load_network(path, bayes.twin.robot)
+    network = load_network(path, _told_robot(bayes))
     return _pooled(network, bayes, path) if method.startswith(BLEND) else network
 
 
-def _pooled(network: LearnedDiagnoser, bayes: BayesDiagnoser, path: Path) -> HybridDiagnoser:
+def _told_robot(bayes: BayesDiagnoser) -> Robot | CalibratedRobot:
+    """Return the robot, with its healthy behaviour where that is not what its profile says."""
+    robot, told = bayes.twin.robot, bayes.imperfections
+    if told is None or told == calibrated(robot).imperfections:
+        return robot
+    return CalibratedRobot(robot, told)
+
+
+def _pooled(network: NetworkDiagnoser, bayes: BayesDiagnoser, path: Path) -> HybridDiagnoser:
     if network.weights_ is None:
         raise InputError(
             f"{path}: how it weighs beside Bayes was never fitted. Train it "

@@ -140,9 +140,17 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str, robot: opt.Robot
 @opt.file_option("--out", "MODEL", "Network to write (.npz).", required=True)
 @click.option(
     "--network",
-    type=click.Choice(["cnn", "motorwise", "lstm"]),
-    default="cnn",
-    help="cnn: convolutional. motorwise: the same network for every motor. lstm: the paper's.",
+    type=click.Choice(["motorwise", "cnn", "lstm"]),
+    default="motorwise",
+    help="motorwise: the same network for every motor of any arm. cnn: convolutional. lstm: the "
+    "paper's.",
+)
+@opt.flag_option("--all-arms", "Learn from all bundled arms: one network for any of them.")
+@click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    default="auto",
+    help="Where to train. auto: on a GPU if there is one.",
 )
 @opt.count_option("--iterations", 6000, "Number of batches, of 64 runs each.", least=1)
 @opt.hypotheses_option(
@@ -154,6 +162,8 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str, robot: opt.Robot
 def train(
     out: Path,
     network: str,
+    all_arms: bool,
+    device: str,
     iterations: int,
     hypotheses: str | None,
     robot: opt.RobotOptions,
@@ -174,11 +184,11 @@ def train(
     check_writable(out)
     known = robot.known
     chosen = parse_cli_hypotheses(hypotheses, robot.model)
-    plan = TrainingPlan(network, iterations, robot.seed, hypotheses=chosen)
+    plan = TrainingPlan(
+        network, iterations, robot.seed, hypotheses=chosen, all_arms=all_arms, device=device
+    )
     with progress_bar("training", iterations) as advance:
-        diagnoser, alone, both = train_network(
-            plan, known.robot, known.imperfections, lambda done: advance(1)
-        )
+        diagnoser, alone, both = train_network(plan, known, lambda done: advance(1))
     save_network(diagnoser, out)
     tell(
         f"of {alone.runs} simulated runs of the physics engine {100.0 * alone.accuracy:.1f} % "

@@ -17,10 +17,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 HEALTHY = "healthy"
-UNSIZED: dict[str, Any] = dict.fromkeys(
-    ("onset_s", "onset_90", "magnitude", "magnitude_unit", "magnitude_90")
-)
-"""Fields that are unknown for a fault that only the network names."""
+SIZED = ("onset_s", "onset_90", "magnitude", "magnitude_unit", "magnitude_90")
+"""Fields that belong to the fault that a diagnosis names."""
 LEAST = 1e-300
 """Lower bound of probabilities before their logarithm."""
 
@@ -90,7 +88,8 @@ class HybridDiagnoser:
     def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
         """Return the diagnosis of each run of a run set.
 
-        Onset and size are those of the Bayesian part, if both agree on the fault.
+        Onset and size are those of the Bayesian part, or of the network if that alone names the
+        fault.
 
         Raises:
             InputError: If the parts have different classes.
@@ -121,6 +120,8 @@ class HybridDiagnoser:
             f"{network.method}",
         )
         if joined.diagnosis != bayes.diagnosis:
-            joined = replace(joined, **UNSIZED)
+            named = joined.diagnosis == network.diagnosis
+            sized: dict[str, Any] = {n: getattr(network, n) if named else None for n in SIZED}
+            joined = replace(joined, **sized)
         ranked = [Hypothesis.parse(name) for name in joined.ranked]
         return worded(joined, ranked, arm_class=self.arm_class)

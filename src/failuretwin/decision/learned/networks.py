@@ -1,4 +1,4 @@
-"""The networks and their training loop: the paper's LSTM, a CNN, and a motor-wise CNN.
+"""Networks on features and their training loop: the paper's LSTM, and a CNN.
 
 Each maps standardised features (run, point, channel) to logits (run, class).
 """
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import ConstantLR, CosineAnnealingLR
 
-from failuretwin.core.errors import unknown_name
+from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.decision.learned.feature_encoder import Floats
 
@@ -24,7 +24,6 @@ HIDDEN = 100
 DROPOUT = 0.1
 """Dropout rate (Table I of the paper)."""
 CNN_WIDTH = 96
-MOTORWISE_WIDTH = 64
 STRIDES = (1, 2, 2, 1)
 """Stride of each convolution: 100 points become 50, then 25."""
 KERNEL = 5
@@ -84,7 +83,8 @@ def _initialise_as_published(layer: nn.LSTM) -> None:
     nn.init.ones_(weights["bias_ih_l0"][HIDDEN : 2 * HIDDEN])
 
 
-def _convolutions(channels: int, wide: int, *, bias: bool = True) -> nn.ModuleList:
+def convolutions(channels: int, wide: int, *, bias: bool = True) -> nn.ModuleList:
+    """Return four convolutions over time."""
     return nn.ModuleList(
         nn.Conv1d(taken, wide, KERNEL, stride=stride, padding=KERNEL // 2, bias=bias)
         for taken, stride in zip((channels, wide, wide, wide), STRIDES, strict=True)
@@ -97,7 +97,7 @@ class Cnn(nn.Module):
     def __init__(self, shape: Shape) -> None:
         super().__init__()
         wide = CNN_WIDTH
-        self.convolutions = _convolutions(shape.channels, wide)
+        self.convolutions = convolutions(shape.channels, wide)
         self.dropout = nn.Dropout(DROPOUT)
         self.hidden = nn.Linear(2 * wide, wide)
         self.dense = nn.Linear(wide, shape.classes)
@@ -115,42 +115,8 @@ class Cnn(nn.Module):
         return self.dense(self.seen(x))
 
 
-class MotorWise(nn.Module):
-    """CNN whose convolutions share their weights between motors.
-
-    Each motor also receives the mean over all motors; only the last layers are motor-specific.
-    """
-
-    def __init__(self, shape: Shape) -> None:
-        super().__init__()
-        self.motors, self.shared = shape.motors, shape.shared
-        self.each = (shape.channels - shape.shared) // shape.motors
-        wide = MOTORWISE_WIDTH
-        self.own = _convolutions(self.each + shape.shared, wide)
-        self.all = _convolutions(self.each + shape.shared, wide, bias=False)
-        self.dropout = nn.Dropout(DROPOUT)
-        self.hidden = nn.Linear(2 * wide * shape.motors, 2 * wide)
-        self.dense = nn.Linear(2 * wide, shape.classes)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return logits (run, class)."""
-        motor, common = torch.split(x, [self.motors * self.each, self.shared], dim=2)
-        motor = torch.unflatten(motor, 2, (self.motors, self.each))
-        common = common.unsqueeze(2).repeat(1, 1, self.motors, 1)
-        x = torch.cat([motor, common], dim=3).permute(0, 2, 3, 1)  # run, motor, channel, point
-        for own_part, all_part in zip(self.own, self.all, strict=True):
-            each = own_part(x.flatten(0, 1)).unflatten(0, (-1, self.motors))
-            x = torch.relu(each + all_part(x.mean(dim=1)).unsqueeze(1))
-        seen = torch.cat([x.mean(dim=3), x.amax(dim=3)], dim=2).flatten(1)
-        return self.dense(self.dropout(torch.relu(self.hidden(seen))))
-
-
-NETWORKS: dict[str, type[PaperLstm] | type[Cnn] | type[MotorWise]] = {
-    "lstm": PaperLstm,
-    "cnn": Cnn,
-    "motorwise": MotorWise,
-}
-"""The networks by name."""
+NETWORKS: dict[str, type[PaperLstm] | type[Cnn]] = {"lstm": PaperLstm, "cnn": Cnn}
+"""The networks on features by name."""
 
 
 def build_network(name: str, shape: Shape) -> nn.Module:
@@ -165,6 +131,25 @@ def build_network(name: str, shape: Shape) -> nn.Module:
 Batch = tuple[Floats, IntArray]
 """Standardised features (run, point, channel) and classes (run,)."""
 
+DEVICES = ("auto", "cpu", "cuda")
+"""Where networks are trained; auto: on a GPU if there is one."""
+
+
+def device_of(name: str) -> torch.device:
+    """Return a device by its name.
+
+    Raises:
+        InputError: If there is none.
+    """
+    if name not in DEVICES:
+        raise unknown_name("device", name, DEVICES)
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda: torch finds no GPU. Use --device auto or cpu.")
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(name)
+
+
 EVALUATED_RUNS = 512
 """Runs evaluated at a time."""
 
@@ -175,13 +160,14 @@ def training(
     iterations: int,
     learning_rate: float = 1e-3,
     decay: bool = False,
+    device: str = "auto",
 ) -> Iterator[int]:
-    """Train a network in place by Adam with cross-entropy loss, on a GPU if there is one.
+    """Train a network in place by Adam with cross-entropy loss.
 
-    With `decay` the learning rate falls to zero along half a cosine. Yields the number of
-    iterations after each; needs at least as many batches.
+    With `decay` the learning rate falls to zero along half a cosine; `device` is one of `DEVICES`.
+    Yields the number of iterations after each; needs at least as many batches.
     """
-    where = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    where = device_of(device)
     network.to(where)
     optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate)
     schedule = CosineAnnealingLR(optimizer, iterations) if decay else ConstantLR(optimizer, 1.0)

@@ -133,7 +133,7 @@ def known_robot(robot: Robot, twin: str) -> CalibratedRobot:
 
 def make_rival_data(plan: RivalPlan, robot: Robot, exam: Exam, folder: Path) -> None:
     """Write the arrays of both twins and the test runs into `folder`."""
-    from failuretwin.decision.training import WIDER, TrainingData, widened
+    from failuretwin.decision.training_data import WIDER, TrainingData, widened
 
     names = class_names(robot)
     published = simulate(Plan(robot, names, plan.runs_per_class, plan.seed))
