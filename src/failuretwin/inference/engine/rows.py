@@ -141,7 +141,7 @@ class Scene:
         return self.pose[:, :, 0]
 
     def healthy_rows(self) -> Rows:
-        """Return the one row of a healthy robot that carries what it always does."""
+        """Return the one row of a healthy robot."""
         runs, count, channels = self.moments.point.shape
         return Rows(
             np.zeros((runs, 1)),
