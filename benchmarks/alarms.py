@@ -2,7 +2,7 @@
 
     python benchmarks/alarms.py [--hours 30] [--faults 200] [--seed 0] [--robot armpi_fpv]
         [--of CALIBRATION] [--by CALIBRATION] [--robots N | --alone] [--sensing SENSING ...]
-        [--picture FILE]
+        [--drift SCATTERS] [--picture FILE]
 
 Movements are seen at rest alone (`alarms_world.py`). Each healthy life is an hour of a robot of its
 own; with --robots N, N robots are drawn and each has taught the watch before. A fault is shown with
@@ -260,13 +260,14 @@ class Delays:
 
 
 def healthy_lives(
-    twin: ft.DigitalTwin, imperfections: Imperfections, hours: int, seed: int, seen: SensorStack
+    works: CalibratedRobot, hours: int, seed: int, seen: SensorStack, drift: float
 ) -> Iterator[Lives]:
-    """Yield healthy lives of an hour."""
+    """Yield healthy lives of an hour, with zeros that drift by so many scatters."""
     for number in range(0, hours, AT_ONCE):
         count = min(AT_ONCE, hours - number)
         faults = ["healthy"] * count
-        yield live(twin, imperfections, faults, MOVEMENTS, ONSET, seed + number, sensors=seen)
+        told = works.twin, works.imperfections, faults, MOVEMENTS, ONSET, seed + number
+        yield live(*told, sensors=seen, drift=drift)
 
 
 def candidates(
@@ -300,13 +301,17 @@ def candidates(
 
 
 def watched(
-    works: CalibratedRobot, mixture: HealthyMixture, counts: tuple[int, int], seed: int
+    works: CalibratedRobot,
+    mixture: HealthyMixture,
+    counts: tuple[int, int],
+    seed: int,
+    drift: float,
 ) -> tuple[list[Seen], Seen]:
     """Return healthy hours and faults of a robot as they are seen; `counts` says how many."""
     names = [str(h) for h in paper_hypotheses(works.robot.motor_names)]
     hours, count = counts
     seen = mixture.filters[0].model.sensors
-    healthy = healthy_lives(works.twin, works.imperfections, hours, seed, seen)
+    healthy = healthy_lives(works, hours, seed, seen, drift)
     faults = [names[1 + k % (len(names) - 1)] for k in range(count)]
     broken = live(
         works.twin, works.imperfections, faults, FAULTY, ONSET, seed + 7_777, sensors=seen
@@ -326,6 +331,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=0, help="so many, which have taught")
     parser.add_argument("--alone", action="store_true", help="believe the calibration for sure")
     parser.add_argument("--sensing", nargs="+", default=["tool"], help="what is believed")
+    parser.add_argument("--drift", type=float, default=0.0, help="of zeros, in scatters")
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     curves: dict[str, list[tuple[float, float]]] = {}
@@ -352,7 +358,7 @@ def study(
         seed = options.seed + 10_000 * group
         taught_by = robot_itself if options.robots else None
         mixture = candidates(known, options.alone, taught_by, seed, parse_sensing(sensing))
-        usual, faulty = watched(robot_itself, mixture, counts, seed)
+        usual, faulty = watched(robot_itself, mixture, counts, seed, options.drift)
         healthy += usual
         broken_parts.append(faulty)
     broken, faults_per_h = joined(broken_parts), mixture.filters[0].faults_per_h

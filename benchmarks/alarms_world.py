@@ -31,6 +31,8 @@ from failuretwin.inference.observation.settings import InferenceSettings
 
 READ_S = 0.05
 """Time from a command to the first reading after it [s], if the bus does not stall."""
+WARM_S = 1200.0
+"""Time constant with which motors warm up [s], assumed."""
 ERROR_RAD = (np.deg2rad(2.4), np.deg2rad(12.0))
 """The paper's steady-state errors, 10 to 50 counts [rad]."""
 
@@ -74,6 +76,7 @@ def live(
     seed: int,
     gaps: bool = True,
     sensors: SensorStack | None = None,
+    drift: float = 0.0,
 ) -> Lives:
     """Return lives, each of a robot drawn anew from what the imperfections say of robots.
 
@@ -86,6 +89,7 @@ def live(
         seed: Seed of all chance.
         gaps: Whether a bus that stalls swallows the readings before a late start.
         sensors: What is seen; None: the tool alone.
+        drift: By how much zeros drift as motors warm up, in scatters.
     """
     rng, robot = np.random.default_rng(seed), twin.robot
     own = [vary(imperfections, rng) for _ in faults]
@@ -104,6 +108,7 @@ def live(
     target[np.arange(len(faults)), :, motor] += off
     base = actual_movements(replace(told, target=target), chance).target
     angle, place, held = _settled(twin, told, chance, faults, motor, spoilt, rng, base)
+    angle = angle + drift * _warm(told, imperfections, seed)
     readings = imperfections.readings
     if readings is not None and readings.whole_counts:
         units = robot.servo_units
@@ -138,6 +143,16 @@ def live(
     onset_s = np.where(spoilt.any(axis=1), begins[:, 0] + np.where(errs, -waits, place), 0.0)
     told_s = begin + REST_S
     return Lives(evidence, hours, faults, first, place < 0.0, held, off, late, onset_s, told_s)
+
+
+def _warm(told: Movements, imperfections: Imperfections, seed: int) -> FloatArray:
+    """Return the drift of each motor for one scatter of it, (life, movement, motor) [rad]."""
+    lives, _, motors = told.target.shape
+    since = told.start - told.start[:, :1]
+    end = np.random.default_rng([seed, 2]).standard_normal((lives, motors))
+    assert imperfections.settling is not None
+    end = end * np.asarray(imperfections.settling.scatter)
+    return np.asarray(end[:, None] * (1.0 - np.exp(-since / WARM_S))[..., None])
 
 
 def _received(told: Movements, chance: Disturbances) -> FloatArray:

@@ -2,21 +2,24 @@
 
     python benchmarks/never_at_rest.py [--robot armpi_fpv ur5e so101 panda] [--motion blended ...]
         [--rate 10] [--calibration generic] [--healthy 20] [--faulty 3] [--clock 0.0] [--folder]
-        [--watch 120]
+        [--calibrated 20] [--told] [--watch 120]
     python benchmarks/never_at_rest.py --logs FOLDER [--share 0.85] [--calibration armpi_fpv]
 
 Five motions, ten seconds each: point to point without a stop, sinusoids, splines as of a leader
 arm, set points at 125 Hz, pick and place in a loop. Each run is of another robot (with `--folder`
 all are of one), drawn from what its class is like: bias, sag, friction, lag; scatter wanders within
 a second or so. A motor gets stuck at any time, or is off by two to four times what can be seen of
-it: by another error after each stroke, or, on curves, by one that comes in mid-run.
+it: by another error after each stroke, or, on curves, by one that comes in mid-run. With
+`--calibrated N` all are of one robot, calibrated from N healthy runs of the same motion. With
+`--told` the diagnosis is told the shares of healthy and faulty runs and the sizes of errors as
+drawn: only then can the calibration error be that of chance.
 """
 
 from __future__ import annotations
 
 import argparse
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +33,7 @@ from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import RunTable, Truth, concatenate
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.arm_classes import generic_imperfections
-from failuretwin.digital_model.nonidealities import vary
+from failuretwin.digital_model.nonidealities import Imperfections, vary
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.servo import first_order_lag
 from failuretwin.digital_model.settling import Settling
@@ -52,6 +55,11 @@ MOTIONS_TRIED = 3
 """Motions by which the smallest error that is seen is told."""
 ONSET_OF_CURVES = 0.2, 0.5
 """When errors on curves come, as shares of a run."""
+
+OWN_SEED = 500_000
+"""Seed of the first healthy run that a robot is calibrated from."""
+NEVER = 1e-6
+"""Factor on the odds of faults that are not drawn."""
 
 Path = Callable[[Robot, FloatArray, np.random.Generator], tuple[FloatArray, FloatArray]]
 """Command (time, motor) [rad] of a robot, and when its strokes end [s]; curves have none."""
@@ -345,6 +353,52 @@ def watch_line(found: list[tuple[str, float, str]], duration_s: float) -> str:
     return ", ".join(parts)
 
 
+def as_drawn(robot: Robot, some: Sequence[Case], seen: FloatArray) -> ft.Priors:
+    """Return the shares and sizes that cases are drawn by; `seen` as of `simulated`."""
+    healthy = sum(case.motor < 0 for case in some)
+    faults = {(case.motor, case.fault) for case in some if case.motor >= 0}
+    each = (len(some) - healthy) / len(faults)
+    sizes = {
+        name: ((LEAST_TIMES * size, MOST_TIMES * size),)
+        for name, size in zip(robot.motor_names, seen.tolist(), strict=True)
+        if size > 0.0
+    }
+    never = [f"{name}:steady_state_error" for name in robot.motor_names if name not in sizes]
+    return ft.Priors(
+        error_ranges=sizes, healthy_odds=healthy / each, fault_factors=dict.fromkeys(never, NEVER)
+    )
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Who judges the runs of one robot and motion."""
+
+    robot: Robot
+    motion: Path
+    sensed: tuple[float, float, FloatArray, Arm | None]
+    given: argparse.Namespace
+
+    def table(self, some: Sequence[Case]) -> xr.Dataset:
+        """Return the runs of some cases."""
+        tables = [simulated(self.robot, self.motion, case, *self.sensed) for case in some]
+        return concatenate([table.to_dataset() for table in tables])
+
+    def found(self, some: Sequence[Case]) -> tuple[list[Diagnosis], float]:
+        """Return what is found of some cases, and the processor time it takes [s]."""
+        given, runs = self.given, self.table(some)
+        known: Imperfections | str = given.calibration
+        if given.calibrated:
+            own = [Case("healthy", -1, OWN_SEED + n) for n in range(given.calibrated)]
+            known = ft.calibrate(self.table(own), self.robot).imperfections
+        priors = as_drawn(self.robot, some, self.sensed[2]) if given.told else None
+        began = clock.process_time()
+        if given.folder:
+            found = ft.SelfCalibratingDiagnoser(self.robot).diagnose(runs)
+        else:
+            found = ft.diagnose(runs, self.robot, known, priors=priors)
+        return found, clock.process_time() - began
+
+
 def line(found: list[Diagnosis], seconds: float) -> str:
     """Return what was found of some runs."""
     healthy = [d for d in found if d.truth == "healthy"]
@@ -372,6 +426,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--watch", type=float, help="length of streams that are watched [s]")
     parser.add_argument("--folder", action="store_true", help="one robot, judged together")
+    parser.add_argument("--calibrated", type=int, default=0, help="from so many healthy runs")
+    parser.add_argument("--told", action="store_true", help="shares and sizes as drawn")
     parser.add_argument("--logs")
     parser.add_argument("--share", type=float)
     given = parser.parse_args()
@@ -383,7 +439,8 @@ def main() -> None:
         robot = load_robot(name)
         for motion in given.motion:
             some = list(cases(robot, given.healthy, given.faulty, given.seed))
-            arm = Arm.drawn(robot, np.random.default_rng(given.seed)) if given.folder else None
+            one = given.folder or given.calibrated
+            arm = Arm.drawn(robot, np.random.default_rng(given.seed)) if one else None
             seen = smallest_seen(robot, MOTIONS[motion], given.seed)
             told = ", ".join(f"{value:.2f}" for value in np.degrees(seen))
             print(f"{name} {motion}: errors are seen from {told} deg on", flush=True)
@@ -395,14 +452,8 @@ def main() -> None:
                 alarms = [watched(robot, stream) for stream in streams]
                 print(f"{name} {motion}: {watch_line(alarms, given.watch)}", flush=True)
                 continue
-            tables = [simulated(robot, MOTIONS[motion], c, *sensed) for c in some]
-            runs = concatenate([table.to_dataset() for table in tables])
-            began = clock.process_time()
-            if given.folder:
-                found = ft.SelfCalibratingDiagnoser(robot).diagnose(runs)
-            else:
-                found = ft.diagnose(runs, robot, given.calibration)
-            print(f"{name} {motion}: {line(found, clock.process_time() - began)}", flush=True)
+            found, seconds = Judge(robot, MOTIONS[motion], sensed, given).found(some)
+            print(f"{name} {motion}: {line(found, seconds)}", flush=True)
             every += found
     if every:
         print(f"all: {line(every, np.nan)}, {calibration(every, np.random.default_rng(0))}")
