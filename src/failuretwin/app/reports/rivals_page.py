@@ -42,15 +42,22 @@ def rivals_table(scores: Sequence[RivalScores]) -> Table:
                 f"{spread_of(one.errors).mean:.3f}",
                 f"{gain:.3f} ({ends[0]:.3f} to {ends[1]:.3f})" if math.isfinite(gain) else "inf",
                 test,
+                _delay(one),
                 f"{one.training_s:.0f}",
                 f"{one.run_ms:.1f}",
             )
         )
     headings = (
         *("method", "protocol", "correct [%]", "95 % interval", "log score [nats]", "ECE"),
-        *("Bayes saves [nats]", "McNemar p", "training [s]", "a run [ms]"),
+        *("Bayes saves [nats]", "McNemar p", "delay [s]; named, false [%]"),
+        *("training [s]", "a run [ms]"),
     )
     return figures_table(headings, rows)
+
+
+def _delay(one: RivalScores) -> str:
+    named, false = one.alarms
+    return f"{one.delay_s:.1f}; {named:.0f}, {false:.0f}"
 
 
 def write_rivals(

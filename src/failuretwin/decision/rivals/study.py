@@ -8,8 +8,9 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,8 @@ from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import load_run_set, replacing, save_run_set, write_text
+from failuretwin.decision.benchmark.tasks import PREFIXES_S, TASKS, Judgement
+from failuretwin.decision.evaluation import Truths, compare, evaluate
 from failuretwin.decision.learned.feature_encoder import (
     FeatureEncoder,
     Floats,
@@ -35,6 +38,7 @@ from failuretwin.decision.learned.paper_study import (
     Exam,
     begin,
     class_names,
+    in_bfloat16,
     spread,
 )
 from failuretwin.decision.results import read_results, write_json_lines
@@ -61,7 +65,11 @@ MODELS = ("kalman", "bayes", "self-calibrating", "hybrid")
 FOLDS = 5
 FINE_TUNING = (1e-4, 0.1)
 """Learning rate, and iterations as a share of those of the training."""
+LATE = ("fine-tuned", "hybrid")
+"""Methods that go on from the CNN of their seed."""
 ANSWERS, TEST = "answers", "test.nc"
+VIEWS = ("", *(f"_{end:g}s" for end in PREFIXES_S))
+"""Suffixes of files: the whole runs, and what is seen of them at three earlier times."""
 
 
 @dataclass(frozen=True)
@@ -146,29 +154,40 @@ def make_rival_data(plan: RivalPlan, robot: Robot, exam: Exam, folder: Path) -> 
     made[IMPERFECT] = (robust, *data.chunk(0, len(published["run"]), robust))
     for twin, (coder, features, classes) in made.items():
         with replacing(folder / f"{twin}.npz") as new, new.open("wb") as file:
-            test = coder.encode(signals_of(exam.runs))
+            test = np.stack([coder.encode(signals_of(seen)) for seen in views_of(exam.runs)])
             np.savez(file, allow_pickle=False, features=features, classes=classes, test=test)
     save_run_set(exam.runs, folder / TEST)
 
 
+def views_of(runs: xr.Dataset) -> list[xr.Dataset]:
+    """Return whole runs, and runs whose commands rest and whose readings end after a time."""
+    views = [runs]
+    for end in PREFIXES_S:
+        seen = runs["time"] < end
+        last = runs["command"].isel(time=int(seen.sum()) - 1)
+        command, measured = runs["command"].where(seen, last), runs["measured"].where(seen)
+        views.append(runs.assign(command=command, measured=measured))
+    return views
+
+
 # One job.
 
-Answer = Callable[[], FloatArray]
-"""Returns the logits or the probabilities of the test runs, (run, class)."""
+Answer = Callable[[int], FloatArray]
+"""Returns logits or probabilities of the test runs in one of the `VIEWS`, (run, class)."""
 
 
 def run_rivals(
     plan: RivalPlan, robot: Robot, exam: Exam, out: Path, on_progress: Callable[[int], None]
 ) -> None:
-    """Run the jobs without a result; hybrids come last: they pool the answers of others."""
+    """Run the jobs without a result; those that go on from others come last."""
     begin(plan, robot, exam, out, make_rival_data)
     jobs, folder = rival_jobs(plan), out / WORK
-    missing = [job for job in jobs if not (folder / ANSWERS / f"{job.name}.json").is_file()]
+    missing = [job for job in jobs if not _cost(folder, job).is_file()]
     (folder / ANSWERS).mkdir(exist_ok=True)
     on_progress(len(jobs) - len(missing))
     work = partial(run_job, plan, str(robot.source), folder)
     for late in (False, True):
-        some = [job for job in missing if (job.method == "hybrid") == late]
+        some = [job for job in missing if (job.method in LATE) == late]
         if some:
             spread(work, some, on_progress)
 
@@ -177,40 +196,53 @@ def run_job(plan: RivalPlan, profile: str, folder: Path, job: RivalJob) -> None:
     """Write the diagnoses of one job, then its cost."""
     robot, test = load_robot(profile), load_run_set(folder / TEST)
     start = time.perf_counter()
-    answer: Answer = partial(_by_model, robot, folder, job, test)
+    answer: Answer = partial(_by_model, robot, folder, job, views_of(test))
     if job.method not in MODELS:
         answer = _by_training(plan, robot, folder, job, test)
     trained = time.perf_counter()
-    chances = answer()
+    chances = [answer(0)]
     seconds = time.perf_counter() - trained
-    truth, names = test["fault"].values, class_names(robot)
-    found = [
-        Diagnosis(
-            str(run),
-            dict(zip(names, map(float, row), strict=True)),
-            truth=str(fault),
-            protocol=job.protocol,
-            method=f"{job.method}, {job.twin} twin",
-        )
-        for run, row, fault in zip(test["run"].values, chances, truth, strict=True)
-    ]
-    path = folder / ANSWERS / job.name
-    write_json_lines(found, path.with_suffix(".jsonl"))
-    cost = {"training_s": trained - start, "run_ms": 1e3 * seconds / len(found)}
-    write_text(json.dumps(cost), path.with_suffix(".json"))
+    chances += [answer(view) for view in range(1, len(VIEWS))]
+    names = class_names(robot)
+    for suffix, rows in zip(VIEWS, chances, strict=True):
+        found = list(_diagnoses(job, names, test, rows))
+        write_json_lines(found, _answers(folder, job, suffix))
+    cost = {"training_s": trained - start, "run_ms": 1e3 * seconds / len(test["run"])}
+    write_text(json.dumps(cost), _cost(folder, job))
 
 
-def _by_model(robot: Robot, folder: Path, job: RivalJob, test: xr.Dataset) -> FloatArray:
+def _answers(folder: Path, job: RivalJob, suffix: str = "") -> Path:
+    return folder / ANSWERS / f"{job.name}{suffix}.jsonl"
+
+
+def _cost(folder: Path, job: RivalJob) -> Path:
+    """Return the file of costs, which is written when a job is done."""
+    return folder / ANSWERS / f"{job.name}.json"
+
+
+def _diagnoses(
+    job: RivalJob, names: Sequence[str], test: xr.Dataset, chances: FloatArray
+) -> Iterator[Diagnosis]:
+    truth, method = test["fault"].values, f"{job.method}, {job.twin} twin"
+    for run, row, fault in zip(test["run"].values, chances, truth, strict=True):
+        posterior = dict(zip(names, map(float, row), strict=True))
+        yield Diagnosis(str(run), posterior, truth=str(fault), protocol=job.protocol, method=method)
+
+
+def _by_model(
+    robot: Robot, folder: Path, job: RivalJob, views: Sequence[xr.Dataset], view: int
+) -> FloatArray:
     """Return the probabilities of a method that is not trained, (run, class)."""
     from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
     from failuretwin.decision.benchmark.baselines import KalmanBank
     from failuretwin.decision.learned.log_pool import PoolWeights, log_pool
     from failuretwin.inference.diagnoser import BayesDiagnoser
 
-    names, known = class_names(robot), known_robot(robot, job.twin)
+    names, known, test = class_names(robot), known_robot(robot, job.twin), views[view]
     if job.method == "hybrid":
-        parts = (f"bayes_{job.twin}_0", f"cnn_{job.twin}_{job.repeat}")
-        stored = [read_results(folder / ANSWERS / f"{part}.jsonl").diagnoses for part in parts]
+        parts = replace(job, method="bayes", repeat=0), replace(job, method="cnn")
+        files = [_answers(folder, part, VIEWS[view]) for part in parts]
+        stored = [read_results(file).diagnoses for file in files]
         bayes, network = (np.array([[d.posterior[n] for n in names] for d in ds]) for ds in stored)
         return log_pool(bayes, network, PoolWeights(*HYBRID_WEIGHTS))
     if job.method == "kalman":
@@ -237,7 +269,7 @@ def _by_training(
     A tenth of the training runs sets the temperature of the probabilities.
     """
     from failuretwin.decision.learned.diagnoser import best_temperature
-    from failuretwin.decision.learned.networks import Standard
+    from failuretwin.decision.learned.networks import Standard, scores_of
 
     rng = np.random.default_rng([plan.seed, job.repeat])
     with np.load(folder / f"{job.twin}.npz", allow_pickle=False) as stored:
@@ -247,22 +279,28 @@ def _by_training(
     learn, judge = order[held:], order[:held]
     standard = Standard.of(features[learn])
     features, target = standard(features), standard(target)
-    answer: Answer
+    logits: Callable[[Floats], FloatArray]
     if job.method in CLASSICAL:
         from failuretwin.decision.rivals import classical
 
         model = getattr(classical, CLASSICAL[job.method])(random_state=job.repeat)
         model.fit(features[learn], classes[learn])
         logits = partial(_logits, len(class_names(robot)), model)
-        held_out, answer = logits(features[judge]), partial(logits, target)
     else:
+        trainer = _Trainer(plan, robot, job, rng, folder)
+        network = trainer.trained((features[learn], classes[learn]), target[0])
+        logits = partial(scores_of, network)
+    if job.method == "fine-tuned":
         truth = np.array([class_names(robot).index(str(f)) for f in test["fault"].values])
-        trainer = _Trainer(plan, robot, job, rng)
-        held_out, answer = trainer.trained(
-            (features[learn], classes[learn]), features[judge], target, truth
-        )
-    temperature = best_temperature(held_out, classes[judge])
-    return lambda: np.asarray(softmax(log_softmax(answer(), axis=1) / temperature, axis=1))
+        answer = trainer.fine_tuned(network, target, truth)
+    else:
+        answer = partial(_seen_by, logits, target)
+    temperature = best_temperature(logits(features[judge]), classes[judge])
+    return lambda view: np.asarray(softmax(log_softmax(answer(view), axis=1) / temperature, axis=1))
+
+
+def _seen_by(logits: Callable[[Floats], FloatArray], target: Floats, view: int) -> FloatArray:
+    return logits(target[view])
 
 
 def _logits(count: int, model: Any, features: Floats) -> FloatArray:
@@ -284,14 +322,10 @@ class _Trainer:
     robot: Robot
     job: RivalJob
     rng: np.random.Generator
+    folder: Path
 
-    def trained(
-        self, learn: Batch, judge: Floats, target: Floats, truth: IntArray
-    ) -> tuple[FloatArray, Answer]:
-        """Return logits of held-out runs, and what gives those of the target runs.
-
-        `truth` of the target runs is for fine-tuning alone.
-        """
+    def trained(self, learn: Batch, target: Floats) -> Any:
+        """Return a trained network; that of the CNN is stored, and fine-tuning goes on from it."""
         import torch
 
         from failuretwin.decision.learned import networks as own
@@ -305,36 +339,44 @@ class _Trainer:
         batches = own.shuffled_batches(*learn, BATCH_RUNS, self.rng)
         name = "cnn" if self.job.method in ADAPTING else self.job.method
         network: Any = other.build(name, shape)
+        stored = self.folder / f"{replace(self.job, method='cnn').name}.pt"
+        if self.job.method == "fine-tuned":
+            network.load_state_dict(torch.load(stored, weights_only=True))
+            return network
         steps = self.plan.iterations, REPRODUCING_RATE
         if self.job.method == "dann":
             run = other.adversarial_training(network, batches, target, *steps, self.rng)
         else:
             run = own.training(network, batches, *steps)
-        for _ in run:
-            pass
-        answer: Answer = partial(own.scores_of, network, target)
-        if self.job.method == "fine-tuned":
-            answer = partial(self._fine_tuned, network, target, truth)
-        return own.scores_of(network, judge), answer
+        deque(in_bfloat16(run), maxlen=0)
+        if self.job.method == "cnn":
+            with replacing(stored) as new:
+                torch.save(network.state_dict(), new)
+        return network
 
-    def _fine_tuned(self, network: Any, target: Floats, truth: IntArray) -> FloatArray:
-        """Return the logits of each fold by a network that went on learning on the others."""
+    def fine_tuned(self, network: Any, target: Floats, truth: IntArray) -> Answer:
+        """Return the logits of each fold by a network that went on learning on the others.
+
+        It learns on whole runs, the first view of `target` (view, run, point, channel).
+        """
         from copy import deepcopy
 
         from failuretwin.decision.learned import networks as own
 
         rate, share = FINE_TUNING
         steps = max(1, round(share * self.plan.iterations))
-        found = np.zeros((len(target), len(class_names(self.robot))))
-        fold_of = folds(truth)
-        for fold in np.unique(fold_of):
-            others, these = fold_of != fold, fold_of == fold
-            tuned = deepcopy(network)
-            batches = own.shuffled_batches(target[others], truth[others], BATCH_RUNS, self.rng)
-            for _ in own.training(tuned, batches, steps if others.any() else 0, rate):
-                pass
-            found[these] = own.scores_of(tuned, target[these])
-        return found
+        tuned, fold_of = [deepcopy(network) for _ in range(FOLDS)], folds(truth)
+        for fold, one in enumerate(tuned):
+            others = fold_of != fold
+            batches = own.shuffled_batches(target[0, others], truth[others], BATCH_RUNS, self.rng)
+            run = own.training(one, batches, steps if others.any() else 0, rate)
+            deque(in_bfloat16(run), maxlen=0)
+
+        def answer(view: int) -> FloatArray:
+            by_fold = [own.scores_of(one, target[view]) for one in tuned]
+            return np.stack(by_fold)[fold_of, np.arange(len(truth))]
+
+        return answer
 
 
 def folds(truth: IntArray) -> IntArray:
@@ -363,6 +405,10 @@ class RivalScores:
         errors: Calibration error of each seed, (seed,).
         gain: Nats a run saved by Bayes, with interval, on the first seed.
         p: Exact McNemar test against Bayes, on the first seed.
+        delay_s: Median time from the onset to a first alarm that names the fault, mean over
+            seeds [s]; alarms are judged at `PREFIXES_S` and at the end.
+        alarms: Share of faulty runs whose first alarm names the fault, and of healthy runs with
+            an alarm; means over seeds.
         training_s: Mean training time [s].
         run_ms: Mean time of a diagnosis [ms].
     """
@@ -376,23 +422,24 @@ class RivalScores:
     errors: tuple[float, ...]
     gain: tuple[float, float, float]
     p: float
+    delay_s: float
+    alarms: tuple[float, float]
     training_s: float
     run_ms: float
 
 
 def rival_scores(plan: RivalPlan, folder: Path) -> Iterator[RivalScores]:
     """Yield the figures of each method; paired tests are against Bayes with the calibration."""
-    from failuretwin.decision.evaluation import compare, evaluate
-
     kinds: dict[tuple[str, str], list[RivalJob]] = {}
     for job in rival_jobs(plan):
         kinds.setdefault((job.method, job.twin), []).append(job)
-    answers = folder / ANSWERS
-    bayes = answers / f"bayes_{IMPERFECT}_0.jsonl"
+    truths = Truths.of(load_run_set(folder / TEST))
+    bayes = _answers(folder, RivalJob("bayes", IMPERFECT, 0))
     for (method, twin), jobs in kinds.items():
-        found = [evaluate(answers / f"{job.name}.jsonl") for job in jobs]
-        costs = [json.loads((answers / f"{job.name}.json").read_text("utf-8")) for job in jobs]
-        against = compare(answers / f"{jobs[0].name}.jsonl", bayes)
+        found = [evaluate(_answers(folder, job)) for job in jobs]
+        costs = [json.loads(_cost(folder, job).read_text("utf-8")) for job in jobs]
+        against = compare(_answers(folder, jobs[0]), bayes)
+        delay, named, false = np.mean([_live(folder, job, truths) for job in jobs], axis=0)
         yield RivalScores(
             method,
             twin,
@@ -403,9 +450,19 @@ def rival_scores(plan: RivalPlan, folder: Path) -> Iterator[RivalScores]:
             tuple(math.nan if (c := e.calibration) is None else c.equal.error for e in found),
             (against.gain.mean, *against.gain.interval),
             against.split.p,
+            float(delay),
+            (float(named), float(false)),
             _mean(costs, "training_s"),
             _mean(costs, "run_ms"),
         )
+
+
+def _live(folder: Path, job: RivalJob, truths: Truths) -> list[float]:
+    """Return delay [s], named faults and false alarms [%], as the benchmark's task `live`."""
+    task = TASKS["live"]
+    whole, *parts = [read_results(_answers(folder, job, view)).diagnoses for view in VIEWS]
+    seen = dict(zip(task.parts, parts, strict=True))
+    return [score.value for score in task.score(Judgement(whole, truths, seen))]
 
 
 def _mean(costs: Sequence[dict[str, float]], key: str) -> float:
