@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from failuretwin.decision.learned.feature_encoder import POINTS
 from failuretwin.decision.learned.networks import (
@@ -103,12 +104,14 @@ def adversarial_training(
     """Train a CNN so that its features do not tell simulated from target runs (DANN).
 
     Ganin et al., JMLR 2016: a second head, behind a reversed gradient, learns to tell them apart.
-    Its strength rises from 0 to 1 as 2 / (1 + exp(-10 p)) - 1. Target runs have no labels.
+    Its strength rises from 0 to 1 as 2 / (1 + exp(-10 p)) - 1. Target runs have no labels. The
+    learning rate falls to zero along half a cosine.
     """
     judge = nn.Sequential(nn.LazyLinear(WIDTH), nn.ReLU(), nn.Linear(WIDTH, 2))
     measure, reverse = nn.CrossEntropyLoss(), cast("Any", _Reversed.apply)
     judge(network.seen(torch.from_numpy(target[:2])))  # sets the size of the lazy layer
     optimizer = torch.optim.Adam([*network.parameters(), *judge.parameters()], lr=learning_rate)
+    schedule = CosineAnnealingLR(optimizer, iterations)
     others = shuffled_batches(target, np.zeros(len(target), dtype=np.int64), len(target), rng)
     for done, (features, classes) in enumerate(islice(batches, iterations), start=1):
         network.train()
@@ -121,4 +124,5 @@ def adversarial_training(
         loss = measure(network.dense(simulated), torch.from_numpy(classes))
         (loss + measure(judge(both), origin)).backward()
         optimizer.step()
+        schedule.step()
         yield done

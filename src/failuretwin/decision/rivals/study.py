@@ -32,7 +32,6 @@ from failuretwin.decision.learned.feature_encoder import (
 )
 from failuretwin.decision.learned.paper_study import (
     BATCH_RUNS,
-    REPRODUCING_RATE,
     VALIDATION_SHARE,
     WORK,
     Exam,
@@ -55,6 +54,8 @@ PUBLISHED, IMPERFECT = TWINS = ("published", "imperfect")
 NETWORKS = ("lstm", "cnn", "tcn", "transformer", "motorwise")
 ADAPTING = {"dann": "P1", "fine-tuned": "P2"}
 """CNNs that learn from target runs, with the protocol letter."""
+DEDICATED = ("hierarchy", "specialists", "motors-3-4")
+"""CNNs for single motors."""
 CLASSICAL = {
     "minirocket": "MiniRocket",
     "boosting": "GradientBoosting",
@@ -63,9 +64,11 @@ CLASSICAL = {
 MODELS = ("kalman", "bayes", "self-calibrating", "hybrid")
 """Methods without training, and the hybrid, which pools one of them with the CNN of its seed."""
 FOLDS = 5
+RATE = 3e-3
+"""First learning rate of the networks; it falls to zero along half a cosine."""
 FINE_TUNING = (1e-4, 0.1)
 """Learning rate, and iterations as a share of those of the training."""
-LATE = ("fine-tuned", "hybrid")
+LATE = ("fine-tuned", "motors-3-4", "hybrid")
 """Methods that go on from the CNN of their seed."""
 ANSWERS, TEST = "answers", "test.nc"
 VIEWS = ("", *(f"_{end:g}s" for end in PREFIXES_S))
@@ -86,7 +89,7 @@ class RivalPlan:
 
     seed: int = 0
     runs_per_class: int = 400
-    iterations: int = 5050
+    iterations: int = 3030
     repeats: int = 5
     stand_in_runs: int = 40
 
@@ -122,7 +125,7 @@ def rival_jobs(plan: RivalPlan) -> list[RivalJob]:
     jobs = []
     for repeat in range(plan.repeats):
         for twin in TWINS:
-            names = [*NETWORKS, *ADAPTING, *CLASSICAL, "hybrid"]
+            names = [*NETWORKS, *ADAPTING, *DEDICATED, *CLASSICAL, "hybrid"]
             names += [m for m in MODELS if m != "hybrid" and repeat == 0]
             one_twin = {"motorwise": IMPERFECT, "hybrid": IMPERFECT, "self-calibrating": PUBLISHED}
             jobs += [RivalJob(n, twin, repeat) for n in names if one_twin.get(n, twin) == twin]
@@ -288,8 +291,12 @@ def _by_training(
         logits = partial(_logits, len(class_names(robot)), model)
     else:
         trainer = _Trainer(plan, robot, job, rng, folder)
-        network = trainer.trained((features[learn], classes[learn]), target[0])
-        logits = partial(scores_of, network)
+        batch = features[learn], classes[learn]
+        if job.method in DEDICATED:
+            logits = trainer.dedicated(batch)
+        else:
+            network = trainer.trained(batch, target[0])
+            logits = partial(scores_of, network)
     if job.method == "fine-tuned":
         truth = np.array([class_names(robot).index(str(f)) for f in test["fault"].values])
         answer = trainer.fine_tuned(network, target, truth)
@@ -328,31 +335,66 @@ class _Trainer:
         """Return a trained network; that of the CNN is stored, and fine-tuning goes on from it."""
         import torch
 
+        from failuretwin.decision.rivals.networks import adversarial_training
+
+        network, batches = self._new(learn, len(class_names(self.robot)))
+        if self.job.method == "fine-tuned":
+            return self._stored(network)
+        if self.job.method == "dann":
+            steps = self.plan.iterations, RATE
+            run = adversarial_training(network, batches, target, *steps, self.rng)
+            deque(in_bfloat16(run), maxlen=0)
+            return network
+        self._run(network, batches)
+        if self.job.method == "cnn":
+            with replacing(self._cnn) as new:
+                torch.save(network.state_dict(), new)
+        return network
+
+    @property
+    def _cnn(self) -> Path:
+        return self.folder / f"{replace(self.job, method='cnn').name}.pt"
+
+    def _stored(self, network: Any) -> Any:
+        import torch
+
+        network.load_state_dict(torch.load(self._cnn, weights_only=True))
+        return network
+
+    def _new(self, learn: Batch, classes: int) -> tuple[Any, Iterator[Batch]]:
+        """Return a network with random weights, and its batches."""
+        import torch
+
         from failuretwin.decision.learned import networks as own
         from failuretwin.decision.learned.diagnoser import network_shape
         from failuretwin.decision.rivals import networks as other
 
         kind = "robust" if self.job.twin == IMPERFECT else "augmented"
-        encoder = FeatureEncoder(kind, self.robot)
-        shape = network_shape(encoder, target.shape[2], len(class_names(self.robot)))
+        shape = network_shape(FeatureEncoder(kind, self.robot), learn[0].shape[2], classes)
         torch.manual_seed(int(self.rng.integers(2**31)))
-        batches = own.shuffled_batches(*learn, BATCH_RUNS, self.rng)
-        name = "cnn" if self.job.method in ADAPTING else self.job.method
-        network: Any = other.build(name, shape)
-        stored = self.folder / f"{replace(self.job, method='cnn').name}.pt"
-        if self.job.method == "fine-tuned":
-            network.load_state_dict(torch.load(stored, weights_only=True))
-            return network
-        steps = self.plan.iterations, REPRODUCING_RATE
-        if self.job.method == "dann":
-            run = other.adversarial_training(network, batches, target, *steps, self.rng)
-        else:
-            run = own.training(network, batches, *steps)
+        own_kind = self.job.method in NETWORKS
+        network = other.build(self.job.method if own_kind else "cnn", shape)
+        return network, own.shuffled_batches(*learn, BATCH_RUNS, self.rng)
+
+    def _run(self, network: Any, batches: Iterator[Batch]) -> None:
+        from failuretwin.decision.learned.networks import training
+
+        run = training(network, batches, self.plan.iterations, RATE, decay=True)
         deque(in_bfloat16(run), maxlen=0)
-        if self.job.method == "cnn":
-            with replacing(stored) as new:
-                torch.save(network.state_dict(), new)
-        return network
+
+    def dedicated(self, learn: Batch) -> Callable[[Floats], FloatArray]:
+        """Return log probabilities by networks of single motors."""
+        from failuretwin.decision.rivals import dedicated
+
+        def train(batch: Batch, classes: int) -> Any:
+            network, batches = self._new(batch, classes)
+            self._run(network, batches)
+            return network
+
+        if self.job.method == "motors-3-4":
+            general = self._stored(self._new(learn, len(class_names(self.robot)))[0])
+            return dedicated.motors_3_and_4(train, learn, general)
+        return getattr(dedicated, self.job.method)(train, learn)
 
     def fine_tuned(self, network: Any, target: Floats, truth: IntArray) -> Answer:
         """Return the logits of each fold by a network that went on learning on the others.
