@@ -332,33 +332,29 @@ class _Trainer:
     folder: Path
 
     def trained(self, learn: Batch, target: Floats) -> Any:
-        """Return a trained network; that of the CNN is stored, and fine-tuning goes on from it."""
-        import torch
-
+        """Return a trained network, stored unless it adapts; fine-tuning goes on from the CNN."""
         from failuretwin.decision.rivals.networks import adversarial_training
 
         network, batches = self._new(learn, len(class_names(self.robot)))
-        if self.job.method == "fine-tuned":
-            return self._stored(network)
         if self.job.method == "dann":
             steps = self.plan.iterations, RATE
             run = adversarial_training(network, batches, target, *steps, self.rng)
             deque(in_bfloat16(run), maxlen=0)
             return network
-        self._run(network, batches)
-        if self.job.method == "cnn":
-            with replacing(self._cnn) as new:
-                torch.save(network.state_dict(), new)
-        return network
+        return self._kept(network, batches)
 
-    @property
-    def _cnn(self) -> Path:
-        return self.folder / f"{replace(self.job, method='cnn').name}.pt"
-
-    def _stored(self, network: Any) -> Any:
+    def _kept(self, network: Any, batches: Iterator[Batch]) -> Any:
+        """Train a network once: load it if it is stored."""
         import torch
 
-        network.load_state_dict(torch.load(self._cnn, weights_only=True))
+        kind = self.job.method if self.job.method in NETWORKS else "cnn"
+        stored = self.folder / f"{replace(self.job, method=kind).name}.pt"
+        if stored.is_file():
+            network.load_state_dict(torch.load(stored, weights_only=True))
+            return network
+        self._run(network, batches)
+        with replacing(stored) as new:
+            torch.save(network.state_dict(), new)
         return network
 
     def _new(self, learn: Batch, classes: int) -> tuple[Any, Iterator[Batch]]:
@@ -392,7 +388,7 @@ class _Trainer:
             return network
 
         if self.job.method == "motors-3-4":
-            general = self._stored(self._new(learn, len(class_names(self.robot)))[0])
+            general = self._kept(*self._new(learn, len(class_names(self.robot))))
             return dedicated.motors_3_and_4(train, learn, general)
         return getattr(dedicated, self.job.method)(train, learn)
 
