@@ -11,6 +11,7 @@ from scipy.stats import multivariate_normal
 from failuretwin.app.reports.rivals_page import rivals_table, write_rivals
 from failuretwin.core.errors import InputError
 from failuretwin.decision.benchmark.baselines import Displacement, KalmanBank, Readings
+from failuretwin.decision.benchmark.tasks import PREFIXES_S
 from failuretwin.decision.learned.feature_encoder import POINTS
 from failuretwin.decision.learned.paper_study import PLAN_FILE, WORK, StudyPlan, stand_in_test_set
 from failuretwin.decision.rivals import study
@@ -100,6 +101,18 @@ def test_the_past_alone_decides_a_temporal_convolution():
     assert not torch.equal(network(x), network(later))
 
 
+def test_views_end_early_and_rest(armpi):
+    runs = stand_in_test_set(StudyPlan(0, stand_in_runs=1), armpi).runs
+    whole, *early = study.views_of(runs)
+    assert whole.equals(runs)
+    for end, view in zip(PREFIXES_S, early, strict=True):
+        seen = runs["time"].values < end
+        for name in ("command", "measured"):
+            np.testing.assert_array_equal(view[name][:, seen], runs[name][:, seen])
+        assert view["measured"][:, ~seen].isnull().all()
+        assert (view["command"][:, ~seen] == view["command"][:, seen][:, -1]).all()
+
+
 def test_folds_hold_blocks_of_every_class():
     truth = np.repeat([0, 1], 10)
     fold = study.folds(truth)
@@ -150,6 +163,7 @@ def test_the_study_in_small(armpi, tmp_path, monkeypatch):
     bayes = next(s for s in scores if (s.method, s.twin) == ("bayes", "imperfect"))
     assert bayes.gain[0] == 0.0 and bayes.p == 1.0
     assert bayes.accuracy[0] > 0.8
+    assert 0.0 <= bayes.delay_s < 10.0 and bayes.alarms[0] > 80.0
     page = write_rivals(scores, TINY, armpi, exam, out).read_text("utf-8")
     assert "80.22" in page and "A small version" in page
     assert (out / "rivals.tex").read_text("utf-8").count(r"\\") == len(scores) + 1
