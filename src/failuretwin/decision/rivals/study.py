@@ -54,8 +54,8 @@ PUBLISHED, IMPERFECT = TWINS = ("published", "imperfect")
 NETWORKS = ("lstm", "cnn", "tcn", "transformer", "motorwise")
 ADAPTING = {"dann": "P1", "fine-tuned": "P2"}
 """CNNs that learn from target runs, with the protocol letter."""
-DEDICATED = ("hierarchy", "specialists", "motors-3-4")
-"""CNNs for single motors."""
+DEDICATED = {"hierarchy": 5, "specialists": 4, "motors-3-4": 2}
+"""CNNs for single motors, with their number: they share the iterations."""
 CLASSICAL = {
     "minirocket": "MiniRocket",
     "boosting": "GradientBoosting",
@@ -352,7 +352,7 @@ class _Trainer:
         if stored.is_file():
             network.load_state_dict(torch.load(stored, weights_only=True))
             return network
-        self._run(network, batches)
+        self._run(network, batches, self.plan.iterations)
         with replacing(stored) as new:
             torch.save(network.state_dict(), new)
         return network
@@ -372,10 +372,10 @@ class _Trainer:
         network = other.build(self.job.method if own_kind else "cnn", shape)
         return network, own.shuffled_batches(*learn, BATCH_RUNS, self.rng)
 
-    def _run(self, network: Any, batches: Iterator[Batch]) -> None:
+    def _run(self, network: Any, batches: Iterator[Batch], iterations: int) -> None:
         from failuretwin.decision.learned.networks import training
 
-        run = training(network, batches, self.plan.iterations, RATE, decay=True)
+        run = training(network, batches, iterations, RATE, decay=True)
         deque(in_bfloat16(run), maxlen=0)
 
     def dedicated(self, learn: Batch) -> Callable[[Floats], FloatArray]:
@@ -384,7 +384,7 @@ class _Trainer:
 
         def train(batch: Batch, classes: int) -> Any:
             network, batches = self._new(batch, classes)
-            self._run(network, batches)
+            self._run(network, batches, self.plan.iterations // DEDICATED[self.job.method])
             return network
 
         if self.job.method == "motors-3-4":
