@@ -198,13 +198,13 @@ def run_rivals(
 def run_job(plan: RivalPlan, profile: str, folder: Path, job: RivalJob) -> None:
     """Write the diagnoses of one job, then its cost."""
     robot, test = load_robot(profile), load_run_set(folder / TEST)
-    start = time.perf_counter()
+    start = time.process_time()
     answer: Answer = partial(_by_model, robot, folder, job, views_of(test))
     if job.method not in MODELS:
         answer = _by_training(plan, robot, folder, job, test)
-    trained = time.perf_counter()
+    trained = time.process_time()
     chances = [answer(0)]
-    seconds = time.perf_counter() - trained
+    seconds = time.process_time() - trained
     chances += [answer(view) for view in range(1, len(VIEWS))]
     names = class_names(robot)
     for suffix, rows in zip(VIEWS, chances, strict=True):
@@ -447,8 +447,8 @@ class RivalScores:
             seeds [s]; alarms are judged at `PREFIXES_S` and at the end.
         alarms: Share of faulty runs whose first alarm names the fault, and of healthy runs with
             an alarm; means over seeds.
-        training_s: Mean training time [s].
-        run_ms: Mean time of a diagnosis [ms].
+        training_s: Mean processor time of a training [s].
+        run_ms: Mean processor time of a diagnosis [ms].
     """
 
     method: str
