@@ -12,7 +12,8 @@ from failuretwin.app.reports.study_page import percent
 from failuretwin.app.terminal import Table, figures_table
 from failuretwin.data_knowledge.store import write_text
 from failuretwin.decision.learned.paper_study import Exam, spread_of
-from failuretwin.decision.rivals.study import RivalPlan, RivalScores
+from failuretwin.decision.rivals.plan import RivalPlan
+from failuretwin.decision.rivals.study import RivalScores
 from failuretwin.digital_model.robot import Robot
 
 PUBLISHED_FIGURES = (
