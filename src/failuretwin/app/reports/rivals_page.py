@@ -58,7 +58,8 @@ def rivals_table(scores: Sequence[RivalScores]) -> Table:
 
 def _delay(one: RivalScores) -> str:
     named, false = one.alarms
-    return f"{one.delay_s:.1f}; {named:.0f}, {false:.0f}"
+    delay = f"{one.delay_s:.1f}" if math.isfinite(one.delay_s) else "-"
+    return f"{delay}; {named:.0f}, {false:.0f}"
 
 
 def write_rivals(

@@ -204,9 +204,9 @@ class RivalScores:
         gain: Nats a run saved by Bayes, with interval, on the first seed.
         p: Exact McNemar test against Bayes, on the first seed.
         delay_s: Median time from the onset to a first alarm that names the fault, mean over
-            seeds [s]; alarms are judged at `PREFIXES_S` and at the end.
+            seeds [s]; NaN: none names it. Alarms are judged at `PREFIXES_S` and at the end.
         alarms: Share of faulty runs whose first alarm names the fault, and of healthy runs with
-            an alarm; means over seeds.
+            an alarm [%]; means over seeds.
         training_s: Mean processor time of a training [s].
         run_ms: Mean processor time of a diagnosis [ms].
     """
@@ -237,7 +237,8 @@ def rival_scores(plan: RivalPlan, folder: Path) -> Iterator[RivalScores]:
         found = [evaluate(_answers(folder, job)) for job in jobs]
         costs = [json.loads(_cost(folder, job).read_text("utf-8")) for job in jobs]
         against = compare(_answers(folder, jobs[0]), bayes)
-        delay, named, false = np.mean([_live(folder, job, truths) for job in jobs], axis=0)
+        live = np.array([_live(folder, job, truths) for job in jobs])
+        delays = live[np.isfinite(live[:, 0]), 0]
         yield RivalScores(
             method,
             twin,
@@ -248,8 +249,8 @@ def rival_scores(plan: RivalPlan, folder: Path) -> Iterator[RivalScores]:
             tuple(math.nan if (c := e.calibration) is None else c.equal.error for e in found),
             (against.gain.mean, *against.gain.interval),
             against.split.p,
-            float(delay),
-            (float(named), float(false)),
+            float(delays.mean()) if len(delays) else math.nan,
+            (float(live[:, 1].mean()), float(live[:, 2].mean())),
             _mean(costs, "training_s"),
             _mean(costs, "run_ms"),
         )
