@@ -8,8 +8,6 @@ PUBLISHED, IMPERFECT = TWINS = ("published", "imperfect")
 NETWORKS = ("lstm", "cnn", "tcn", "transformer", "motorwise")
 ADAPTING = {"dann": "P1", "fine-tuned": "P2"}
 """CNNs that learn from target runs, with the protocol letter."""
-DEDICATED = {"hierarchy": 5, "specialists": 4, "motors-3-4": 2}
-"""CNNs for single motors, with their number: they share the iterations."""
 CLASSICAL = {
     "minirocket": "MiniRocket",
     "boosting": "GradientBoosting",
@@ -17,7 +15,7 @@ CLASSICAL = {
 }
 MODELS = ("kalman", "bayes", "self-calibrating", "hybrid")
 """Methods without training, and the hybrid, which pools one of them with the CNN of its seed."""
-LATE = ("fine-tuned", "motors-3-4", "hybrid")
+LATE = ("fine-tuned", "hybrid")
 """Methods that go on from the CNN of their seed."""
 
 
@@ -71,7 +69,7 @@ def rival_jobs(plan: RivalPlan) -> list[RivalJob]:
     jobs = []
     for repeat in range(plan.repeats):
         for twin in TWINS:
-            names = [*NETWORKS, *ADAPTING, *DEDICATED, *CLASSICAL, "hybrid"]
+            names = [*NETWORKS, *ADAPTING, *CLASSICAL, "hybrid"]
             names += [m for m in MODELS if m != "hybrid" and repeat == 0]
             one_twin = {"motorwise": IMPERFECT, "hybrid": IMPERFECT, "self-calibrating": PUBLISHED}
             jobs += [RivalJob(n, twin, repeat) for n in names if one_twin.get(n, twin) == twin]

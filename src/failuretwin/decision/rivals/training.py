@@ -23,7 +23,6 @@ from failuretwin.decision.learned.paper_study import (
 )
 from failuretwin.decision.rivals.plan import (
     CLASSICAL,
-    DEDICATED,
     IMPERFECT,
     NETWORKS,
     RivalJob,
@@ -72,12 +71,8 @@ def by_training(
         logits = partial(_logits, len(class_names(robot)), model)
     else:
         trainer = _Trainer(plan, robot, job, rng, folder)
-        batch = features[learn], classes[learn]
-        if job.method in DEDICATED:
-            logits = trainer.dedicated(batch)
-        else:
-            network = trainer.trained(batch, target[0])
-            logits = partial(scores_of, network)
+        network = trainer.trained((features[learn], classes[learn]), target[0])
+        logits = partial(scores_of, network)
     if job.method == "fine-tuned":
         truth = np.array([class_names(robot).index(str(f)) for f in test["fault"].values])
         answer = trainer.fine_tuned(network, target, truth)
@@ -128,12 +123,15 @@ class _Trainer:
         """Train a network once: load it if it is stored."""
         import torch
 
+        from failuretwin.decision.learned.networks import training
+
         kind = self.job.method if self.job.method in NETWORKS else "cnn"
         stored = self.folder / f"{replace(self.job, method=kind).name}.pt"
         if stored.is_file():
             network.load_state_dict(torch.load(stored, weights_only=True))
             return network
-        self._run(network, batches, self.plan.iterations)
+        run = training(network, batches, self.plan.iterations, RATE, decay=True)
+        deque(in_bfloat16(run), maxlen=0)
         with replacing(stored) as new:
             torch.save(network.state_dict(), new)
         return network
@@ -152,26 +150,6 @@ class _Trainer:
         own_kind = self.job.method in NETWORKS
         network = other.build(self.job.method if own_kind else "cnn", shape)
         return network, own.shuffled_batches(*learn, BATCH_RUNS, self.rng)
-
-    def _run(self, network: Any, batches: Iterator[Batch], iterations: int) -> None:
-        from failuretwin.decision.learned.networks import training
-
-        run = training(network, batches, iterations, RATE, decay=True)
-        deque(in_bfloat16(run), maxlen=0)
-
-    def dedicated(self, learn: Batch) -> Callable[[Floats], FloatArray]:
-        """Return log probabilities by networks of single motors."""
-        from failuretwin.decision.rivals import dedicated
-
-        def train(batch: Batch, classes: int) -> Any:
-            network, batches = self._new(batch, classes)
-            self._run(network, batches, self.plan.iterations // DEDICATED[self.job.method])
-            return network
-
-        if self.job.method == "motors-3-4":
-            general = self._kept(*self._new(learn, len(class_names(self.robot))))
-            return dedicated.motors_3_and_4(train, learn, general)
-        return getattr(dedicated, self.job.method)(train, learn)
 
     def fine_tuned(self, network: Any, target: Floats, truth: IntArray) -> Answer:
         """Return the logits of each fold by a network that went on learning on the others.
