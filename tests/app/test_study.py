@@ -31,6 +31,7 @@ from failuretwin.decision.learned.paper_study import (
     Training,
     check_folder,
     given_test_set,
+    in_bfloat16,
     mean_confusion,
     quick_plan,
     ratio_spreads,
@@ -198,3 +199,17 @@ def test_test_runs_without_a_truth_are_refused(write_session, tmp_path):
     with pytest.raises(InputError, match="--published-labels"):
         run("--out", tmp_path / "out", "--test", session)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("native", [False, True])
+def test_products_are_in_bfloat16_where_the_processor_has_units(native, monkeypatch):
+    torch = pytest.importorskip("torch")
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": native})
+
+    def steps():
+        for _ in range(2):
+            yield torch.is_autocast_enabled("cpu")
+
+    for inside in in_bfloat16(steps()):
+        assert inside == native
+        assert not torch.is_autocast_enabled("cpu")

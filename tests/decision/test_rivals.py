@@ -11,12 +11,15 @@ from scipy.stats import multivariate_normal
 from failuretwin.app.reports.rivals_page import rivals_table, write_rivals
 from failuretwin.core.errors import InputError
 from failuretwin.decision.benchmark.baselines import Displacement, KalmanBank, Readings
+from failuretwin.decision.benchmark.tasks import PREFIXES_S
 from failuretwin.decision.learned.feature_encoder import POINTS
 from failuretwin.decision.learned.paper_study import PLAN_FILE, WORK, StudyPlan, stand_in_test_set
 from failuretwin.decision.rivals import study
+from failuretwin.decision.rivals.plan import LATE, RivalJob, RivalPlan, rival_jobs
+from failuretwin.decision.rivals.training import folds
 from failuretwin.digital_model.twin import DigitalTwin
 
-TINY = study.RivalPlan(0, 4, 2, 1, 2)
+TINY = RivalPlan(0, 4, 2, 1, 2)
 SOME = ("cnn", "dann", "fine-tuned", "nearest", "bayes", "hybrid")
 """Methods of the small study: one of each way that a job can go."""
 
@@ -100,14 +103,26 @@ def test_the_past_alone_decides_a_temporal_convolution():
     assert not torch.equal(network(x), network(later))
 
 
+def test_views_end_early_and_rest(armpi):
+    runs = stand_in_test_set(StudyPlan(0, stand_in_runs=1), armpi).runs
+    whole, *early = study.views_of(runs)
+    assert whole.equals(runs)
+    for end, view in zip(PREFIXES_S, early, strict=True):
+        seen = runs["time"].values < end
+        for name in ("command", "measured"):
+            np.testing.assert_array_equal(view[name][:, seen], runs[name][:, seen])
+        assert view["measured"][:, ~seen].isnull().all()
+        assert (view["command"][:, ~seen] == view["command"][:, seen][:, -1]).all()
+
+
 def test_folds_hold_blocks_of_every_class():
     truth = np.repeat([0, 1], 10)
-    fold = study.folds(truth)
+    fold = folds(truth)
     assert fold.tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4] * 2
 
 
 def test_every_method_of_the_text_has_a_job():
-    jobs = study.rival_jobs(study.RivalPlan())
+    jobs = rival_jobs(RivalPlan())
     assert len(set(jobs)) == len(jobs)
     seeds = {j.method: sum(o.method == j.method and o.twin == j.twin for o in jobs) for j in jobs}
     assert {name for name, count in seeds.items() if count == 1} == {
@@ -133,14 +148,14 @@ def test_the_study_in_small(armpi, tmp_path, monkeypatch):
             done.append(job)
             on_progress(1)
 
-    jobs = [j for j in study.rival_jobs(TINY) if j.method in SOME and j.twin == "imperfect"]
-    jobs.append(study.RivalJob("nearest", "published", 0))
+    jobs = [j for j in rival_jobs(TINY) if j.method in SOME and j.twin == "imperfect"]
+    jobs.append(RivalJob("nearest", "published", 0))
     monkeypatch.setattr(study, "spread", one_by_one)
     monkeypatch.setattr(study, "rival_jobs", lambda plan: jobs)
     exam = stand_in_test_set(StudyPlan(0, stand_in_runs=TINY.stand_in_runs), armpi)
     out = tmp_path / "out"
     study.run_rivals(TINY, armpi, exam, out, lambda count: None)
-    assert done == sorted(jobs, key=lambda job: job.method == "hybrid")
+    assert done == sorted(jobs, key=lambda job: job.method in LATE)
     done.clear()
     answers = out / WORK / study.ANSWERS
     (answers / "nearest_published_0.json").unlink()
@@ -150,6 +165,7 @@ def test_the_study_in_small(armpi, tmp_path, monkeypatch):
     bayes = next(s for s in scores if (s.method, s.twin) == ("bayes", "imperfect"))
     assert bayes.gain[0] == 0.0 and bayes.p == 1.0
     assert bayes.accuracy[0] > 0.8
+    assert 0.0 <= bayes.delay_s < 10.0 and bayes.alarms[0] > 80.0
     page = write_rivals(scores, TINY, armpi, exam, out).read_text("utf-8")
     assert "80.22" in page and "A small version" in page
     assert (out / "rivals.tex").read_text("utf-8").count(r"\\") == len(scores) + 1
@@ -157,4 +173,4 @@ def test_the_study_in_small(armpi, tmp_path, monkeypatch):
     stored = json.loads((out / PLAN_FILE).read_text("utf-8"))
     assert stored["iterations"] == 2
     with pytest.raises(InputError, match="has repeats 1, this one 5"):
-        study.run_rivals(study.RivalPlan(0, 4, 2, 5, 2), armpi, exam, out, lambda count: None)
+        study.run_rivals(RivalPlan(0, 4, 2, 5, 2), armpi, exam, out, lambda count: None)

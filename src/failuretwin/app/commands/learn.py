@@ -262,19 +262,20 @@ def _rivals(
     """Compare the rivals and write table and page."""
     from failuretwin.app.reports.rivals_page import rivals_table, write_rivals
     from failuretwin.decision.learned import paper_study as paper
-    from failuretwin.decision.rivals import study as rivals
+    from failuretwin.decision.rivals.plan import RivalPlan, quick_rivals, rival_jobs
+    from failuretwin.decision.rivals.study import rival_scores, run_rivals
 
     model, seed = robot.model, robot.seed
-    plan = rivals.quick_rivals(seed) if quick else rivals.RivalPlan(seed)
+    plan = quick_rivals(seed) if quick else RivalPlan(seed)
     exam = (
         paper.stand_in_test_set(paper.StudyPlan(seed, stand_in_runs=plan.stand_in_runs), model)
         if test is None
         else paper.given_test_set(test, model, published_labels, "measured")
     )
-    jobs = len(rivals.rival_jobs(plan))
+    jobs = len(rival_jobs(plan))
     tell(f"{jobs} trainings and diagnoses, networks of {plan.iterations} iterations")
     with progress_bar("rivals", jobs) as advance:
-        rivals.run_rivals(plan, model, exam, out, advance)
-    scores = list(rivals.rival_scores(plan, out / paper.WORK))
+        run_rivals(plan, model, exam, out, advance)
+    scores = list(rival_scores(plan, out / paper.WORK))
     show(rivals_table(scores))
     tell(f"written to {write_rivals(scores, plan, model, exam, out)}")

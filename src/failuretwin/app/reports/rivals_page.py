@@ -12,7 +12,8 @@ from failuretwin.app.reports.study_page import percent
 from failuretwin.app.terminal import Table, figures_table
 from failuretwin.data_knowledge.store import write_text
 from failuretwin.decision.learned.paper_study import Exam, spread_of
-from failuretwin.decision.rivals.study import RivalPlan, RivalScores
+from failuretwin.decision.rivals.plan import RivalPlan
+from failuretwin.decision.rivals.study import RivalScores
 from failuretwin.digital_model.robot import Robot
 
 PUBLISHED_FIGURES = (
@@ -42,15 +43,23 @@ def rivals_table(scores: Sequence[RivalScores]) -> Table:
                 f"{spread_of(one.errors).mean:.3f}",
                 f"{gain:.3f} ({ends[0]:.3f} to {ends[1]:.3f})" if math.isfinite(gain) else "inf",
                 test,
+                _delay(one),
                 f"{one.training_s:.0f}",
                 f"{one.run_ms:.1f}",
             )
         )
     headings = (
         *("method", "protocol", "correct [%]", "95 % interval", "log score [nats]", "ECE"),
-        *("Bayes saves [nats]", "McNemar p", "training [s]", "a run [ms]"),
+        *("Bayes saves [nats]", "McNemar p", "delay [s]; named, false [%]"),
+        *("training [s]", "a run [ms]"),
     )
     return figures_table(headings, rows)
+
+
+def _delay(one: RivalScores) -> str:
+    named, false = one.alarms
+    delay = f"{one.delay_s:.1f}" if math.isfinite(one.delay_s) else "-"
+    return f"{delay}; {named:.0f}, {false:.0f}"
 
 
 def write_rivals(

@@ -112,8 +112,8 @@ class KalmanBank(Calibrated):
         for hypothesis in hypotheses:
             angle, displacement = self._model(hypothesis.faults, expected, signals.time, runs)
             likelihood.append(self.log_likelihood(readings, angle, displacement))
-        alike = max(1.0, LASTING_S / float(np.median(np.diff(signals.time))))
-        chances = softmax(np.stack(likelihood, axis=1) / alike, axis=1)
+        alike = np.array([_alike(signals.time[seen]) for seen in signals.seen])
+        chances = softmax(np.stack(likelihood, axis=1) / alike[:, None], axis=1)
         return _diagnoses(runs, [str(h) for h in hypotheses], chances)
 
     def _expected(self, signals: Signals, runs: xr.Dataset) -> FloatArray:
@@ -176,6 +176,11 @@ class KalmanBank(Calibrated):
             spread = np.einsum("rmn,rnk,rlk->rml", left, spread, left)  # Joseph's form
             spread += np.einsum("rma,ab,rnb->rmn", gain, noise, gain)
         return total
+
+
+def _alike(time: FloatArray) -> float:
+    """Return the number of readings of a run that count as one."""
+    return max(1.0, LASTING_S / float(np.median(np.diff(time)))) if len(time) > 1 else 1.0
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
@@ -232,6 +232,22 @@ def _start() -> None:
     torch.set_num_threads(1)
 
 
+def in_bfloat16(steps: Iterator[int]) -> Iterator[int]:
+    """Yield the steps of a training whose matrix products are in bfloat16.
+
+    Where the processor has no units for these products (AMX), they stay in single precision.
+    """
+    import torch
+
+    native = torch.cpu.get_capabilities().get("amx_bf16", False)
+    while True:
+        with torch.autocast("cpu", torch.bfloat16, enabled=native):
+            step = next(steps, None)
+        if step is None:
+            return
+        yield step
+
+
 def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
     """Run one training and write its result into `folder`."""
     import torch
@@ -247,7 +263,8 @@ def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
     batches = networks.shuffled_batches(*sets["training"], BATCH_RUNS, rng)
     accuracies: dict[str, tuple[float, ...]] = dict.fromkeys(sets, ())
     confusion = np.zeros((classes, classes), dtype=np.int64)
-    for iteration in networks.training(network, batches, plan.iterations, job.learning_rate):
+    steps = networks.training(network, batches, plan.iterations, job.learning_rate)
+    for iteration in in_bfloat16(steps):
         if iteration in plan.checkpoints:
             for name, (features, truth) in sets.items():
                 diagnosis = networks.scores_of(network, features).argmax(axis=1)

@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from failuretwin.decision.learned.feature_encoder import POINTS
 from failuretwin.decision.learned.networks import (
@@ -37,7 +38,7 @@ class Tcn(nn.Module):
         self.blocks = nn.ModuleList(
             nn.Conv1d(WIDTH, WIDTH, self.KERNEL, dilation=d) for d in self.DILATIONS
         )
-        self.dropout = nn.Dropout(DROPOUT)
+        self.dropout = nn.Dropout1d(DROPOUT)  # of whole channels, as there
         self.dense = nn.Linear(WIDTH, shape.classes)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -50,19 +51,25 @@ class Tcn(nn.Module):
 
 
 class Transformer(nn.Module):
-    """Two encoder layers with learned positions, mean over time (Vaswani et al., 2017)."""
+    """Two encoder layers with learned positions, mean over time (Vaswani et al., 2017).
+
+    A token holds two points, which takes half of the time.
+    """
+
+    PATCH = 2
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
-        self.embed = nn.Linear(shape.channels, WIDTH)
-        self.position = nn.Parameter(0.02 * torch.randn(POINTS, WIDTH))
+        self.embed = nn.Linear(self.PATCH * shape.channels, WIDTH)
+        self.position = nn.Parameter(0.02 * torch.randn(POINTS // self.PATCH, WIDTH))
         layer = nn.TransformerEncoderLayer(WIDTH, 4, 2 * WIDTH, DROPOUT, batch_first=True)
         self.layers = nn.TransformerEncoder(layer, 2, enable_nested_tensor=False)
         self.dense = nn.Linear(WIDTH, shape.classes)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return logits (run, class)."""
-        return self.dense(self.layers(self.embed(x) + self.position).mean(dim=1))
+        tokens = self.embed(x.reshape(len(x), POINTS // self.PATCH, -1))
+        return self.dense(self.layers(tokens + self.position).mean(dim=1))
 
 
 class MotorWise(nn.Module):
@@ -100,7 +107,7 @@ def build(name: str, shape: Shape) -> nn.Module:
     own: dict[str, type[nn.Module]] = {
         "tcn": Tcn,
         "transformer": Transformer,
-        "motorwise": MotorWise,
+        "motorwise-cnn": MotorWise,
     }
     return own[name](shape) if name in own else build_network(name, shape)
 
@@ -132,12 +139,14 @@ def adversarial_training(
     """Train a CNN so that its features do not tell simulated from target runs (DANN).
 
     Ganin et al., JMLR 2016: a second head, behind a reversed gradient, learns to tell them apart.
-    Its strength rises from 0 to 1 as 2 / (1 + exp(-10 p)) - 1. Target runs have no labels.
+    Its strength rises from 0 to 1 as 2 / (1 + exp(-10 p)) - 1. Target runs have no labels. The
+    learning rate falls to zero along half a cosine.
     """
     judge = nn.Sequential(nn.LazyLinear(WIDTH), nn.ReLU(), nn.Linear(WIDTH, 2))
     measure, reverse = nn.CrossEntropyLoss(), cast("Any", _Reversed.apply)
     judge(network.seen(torch.from_numpy(target[:2])))  # sets the size of the lazy layer
     optimizer = torch.optim.Adam([*network.parameters(), *judge.parameters()], lr=learning_rate)
+    schedule = CosineAnnealingLR(optimizer, iterations)
     others = shuffled_batches(target, np.zeros(len(target), dtype=np.int64), len(target), rng)
     for done, (features, classes) in enumerate(islice(batches, iterations), start=1):
         network.train()
@@ -150,4 +159,5 @@ def adversarial_training(
         loss = measure(network.dense(simulated), torch.from_numpy(classes))
         (loss + measure(judge(both), origin)).backward()
         optimizer.step()
+        schedule.step()
         yield done

@@ -9,28 +9,25 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import log_softmax, softmax
 
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import load_run_set, replacing, save_run_set, write_text
+from failuretwin.decision.benchmark.tasks import PREFIXES_S, TASKS, Judgement
+from failuretwin.decision.evaluation import Truths, compare, evaluate
 from failuretwin.decision.learned.feature_encoder import (
     FeatureEncoder,
-    Floats,
     expectation_of,
     signals_of,
 )
 from failuretwin.decision.learned.paper_study import (
-    BATCH_RUNS,
-    REPRODUCING_RATE,
-    VALIDATION_SHARE,
     WORK,
     Exam,
     begin,
@@ -38,6 +35,16 @@ from failuretwin.decision.learned.paper_study import (
     spread,
 )
 from failuretwin.decision.results import read_results, write_json_lines
+from failuretwin.decision.rivals.plan import (
+    IMPERFECT,
+    LATE,
+    MODELS,
+    PUBLISHED,
+    RivalJob,
+    RivalPlan,
+    rival_jobs,
+)
+from failuretwin.decision.rivals.training import Answer, by_training
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.robot import Robot, load_robot
@@ -45,80 +52,9 @@ from failuretwin.digital_model.robot import Robot, load_robot
 if TYPE_CHECKING:
     import xarray as xr
 
-    from failuretwin.decision.learned.networks import Batch
-
-PUBLISHED, IMPERFECT = TWINS = ("published", "imperfect")
-NETWORKS = ("lstm", "cnn", "tcn", "transformer", "motorwise")
-ADAPTING = {"dann": "P1", "fine-tuned": "P2"}
-"""CNNs that learn from target runs, with the protocol letter."""
-CLASSICAL = {
-    "minirocket": "MiniRocket",
-    "boosting": "GradientBoosting",
-    "nearest": "NearestSimulation",
-}
-MODELS = ("kalman", "bayes", "self-calibrating", "hybrid")
-"""Methods without training, and the hybrid, which pools one of them with the CNN of its seed."""
-FOLDS = 5
-FINE_TUNING = (1e-4, 0.1)
-"""Learning rate, and iterations as a share of those of the training."""
 ANSWERS, TEST = "answers", "test.nc"
-
-
-@dataclass(frozen=True)
-class RivalPlan:
-    """Sizes of the study.
-
-    Attributes:
-        seed: Random seed.
-        runs_per_class: Simulated training runs of each class, for every method.
-        iterations: Batches of 32 runs, for every network.
-        repeats: Seeds.
-        stand_in_runs: Runs per class of the stand-in test set by the physics engine.
-    """
-
-    seed: int = 0
-    runs_per_class: int = 400
-    iterations: int = 5050
-    repeats: int = 5
-    stand_in_runs: int = 40
-
-
-def quick_rivals(seed: int) -> RivalPlan:
-    """Return a small study."""
-    return RivalPlan(seed, 40, 60, 1, 4)
-
-
-@dataclass(frozen=True)
-class RivalJob:
-    """One method, trained on runs of one twin with one seed."""
-
-    method: str
-    twin: str
-    repeat: int
-
-    @property
-    def name(self) -> str:
-        """Name of its file, without suffix."""
-        return f"{self.method}_{self.twin}_{self.repeat}"
-
-    @property
-    def protocol(self) -> str:
-        """Protocol letter; the imperfect twin was calibrated on healthy logs."""
-        if self.method == "self-calibrating":
-            return "P1"
-        return ADAPTING.get(self.method, "P0" if self.twin == PUBLISHED else "P0c")
-
-
-def rival_jobs(plan: RivalPlan) -> list[RivalJob]:
-    """Return all jobs; methods without chance have one, and those of one twin only that."""
-    jobs = []
-    for repeat in range(plan.repeats):
-        for twin in TWINS:
-            names = [*NETWORKS, *ADAPTING, *CLASSICAL, "hybrid"]
-            names += [m for m in MODELS if m != "hybrid" and repeat == 0]
-            one_twin = {"motorwise": IMPERFECT, "hybrid": IMPERFECT, "self-calibrating": PUBLISHED}
-            jobs += [RivalJob(n, twin, repeat) for n in names if one_twin.get(n, twin) == twin]
-    return jobs
+VIEWS = ("", *(f"_{end:g}s" for end in PREFIXES_S))
+"""Suffixes of files: the whole runs, and what is seen of them at three earlier times."""
 
 
 def known_robot(robot: Robot, twin: str) -> CalibratedRobot:
@@ -146,29 +82,37 @@ def make_rival_data(plan: RivalPlan, robot: Robot, exam: Exam, folder: Path) -> 
     made[IMPERFECT] = (robust, *data.chunk(0, len(published["run"]), robust))
     for twin, (coder, features, classes) in made.items():
         with replacing(folder / f"{twin}.npz") as new, new.open("wb") as file:
-            test = coder.encode(signals_of(exam.runs))
+            test = np.stack([coder.encode(signals_of(seen)) for seen in views_of(exam.runs)])
             np.savez(file, allow_pickle=False, features=features, classes=classes, test=test)
     save_run_set(exam.runs, folder / TEST)
 
 
-# One job.
+def views_of(runs: xr.Dataset) -> list[xr.Dataset]:
+    """Return whole runs, and runs whose commands rest and whose readings end after a time."""
+    views = [runs]
+    for end in PREFIXES_S:
+        seen = runs["time"] < end
+        last = runs["command"].isel(time=int(seen.sum()) - 1)
+        command, measured = runs["command"].where(seen, last), runs["measured"].where(seen)
+        views.append(runs.assign(command=command, measured=measured))
+    return views
 
-Answer = Callable[[], FloatArray]
-"""Returns the logits or the probabilities of the test runs, (run, class)."""
+
+# One job.
 
 
 def run_rivals(
     plan: RivalPlan, robot: Robot, exam: Exam, out: Path, on_progress: Callable[[int], None]
 ) -> None:
-    """Run the jobs without a result; hybrids come last: they pool the answers of others."""
+    """Run the jobs without a result; those that go on from others come last."""
     begin(plan, robot, exam, out, make_rival_data)
     jobs, folder = rival_jobs(plan), out / WORK
-    missing = [job for job in jobs if not (folder / ANSWERS / f"{job.name}.json").is_file()]
+    missing = [job for job in jobs if not _cost(folder, job).is_file()]
     (folder / ANSWERS).mkdir(exist_ok=True)
     on_progress(len(jobs) - len(missing))
     work = partial(run_job, plan, str(robot.source), folder)
     for late in (False, True):
-        some = [job for job in missing if (job.method == "hybrid") == late]
+        some = [job for job in missing if (job.method in LATE) == late]
         if some:
             spread(work, some, on_progress)
 
@@ -176,41 +120,54 @@ def run_rivals(
 def run_job(plan: RivalPlan, profile: str, folder: Path, job: RivalJob) -> None:
     """Write the diagnoses of one job, then its cost."""
     robot, test = load_robot(profile), load_run_set(folder / TEST)
-    start = time.perf_counter()
-    answer: Answer = partial(_by_model, robot, folder, job, test)
+    start = time.process_time()
+    answer: Answer = partial(_by_model, robot, folder, job, views_of(test))
     if job.method not in MODELS:
-        answer = _by_training(plan, robot, folder, job, test)
-    trained = time.perf_counter()
-    chances = answer()
-    seconds = time.perf_counter() - trained
-    truth, names = test["fault"].values, class_names(robot)
-    found = [
-        Diagnosis(
-            str(run),
-            dict(zip(names, map(float, row), strict=True)),
-            truth=str(fault),
-            protocol=job.protocol,
-            method=f"{job.method}, {job.twin} twin",
-        )
-        for run, row, fault in zip(test["run"].values, chances, truth, strict=True)
-    ]
-    path = folder / ANSWERS / job.name
-    write_json_lines(found, path.with_suffix(".jsonl"))
-    cost = {"training_s": trained - start, "run_ms": 1e3 * seconds / len(found)}
-    write_text(json.dumps(cost), path.with_suffix(".json"))
+        answer = by_training(plan, robot, folder, job, test)
+    trained = time.process_time()
+    chances = [answer(0)]
+    seconds = time.process_time() - trained
+    chances += [answer(view) for view in range(1, len(VIEWS))]
+    names = class_names(robot)
+    for suffix, rows in zip(VIEWS, chances, strict=True):
+        found = list(_diagnoses(job, names, test, rows))
+        write_json_lines(found, _answers(folder, job, suffix))
+    cost = {"training_s": trained - start, "run_ms": 1e3 * seconds / len(test["run"])}
+    write_text(json.dumps(cost), _cost(folder, job))
 
 
-def _by_model(robot: Robot, folder: Path, job: RivalJob, test: xr.Dataset) -> FloatArray:
+def _answers(folder: Path, job: RivalJob, suffix: str = "") -> Path:
+    return folder / ANSWERS / f"{job.name}{suffix}.jsonl"
+
+
+def _cost(folder: Path, job: RivalJob) -> Path:
+    """Return the file of costs, which is written when a job is done."""
+    return folder / ANSWERS / f"{job.name}.json"
+
+
+def _diagnoses(
+    job: RivalJob, names: Sequence[str], test: xr.Dataset, chances: FloatArray
+) -> Iterator[Diagnosis]:
+    truth, method = test["fault"].values, f"{job.method}, {job.twin} twin"
+    for run, row, fault in zip(test["run"].values, chances, truth, strict=True):
+        posterior = dict(zip(names, map(float, row), strict=True))
+        yield Diagnosis(str(run), posterior, truth=str(fault), protocol=job.protocol, method=method)
+
+
+def _by_model(
+    robot: Robot, folder: Path, job: RivalJob, views: Sequence[xr.Dataset], view: int
+) -> FloatArray:
     """Return the probabilities of a method that is not trained, (run, class)."""
     from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
     from failuretwin.decision.benchmark.baselines import KalmanBank
     from failuretwin.decision.learned.log_pool import PoolWeights, log_pool
     from failuretwin.inference.diagnoser import BayesDiagnoser
 
-    names, known = class_names(robot), known_robot(robot, job.twin)
+    names, known, test = class_names(robot), known_robot(robot, job.twin), views[view]
     if job.method == "hybrid":
-        parts = (f"bayes_{job.twin}_0", f"cnn_{job.twin}_{job.repeat}")
-        stored = [read_results(folder / ANSWERS / f"{part}.jsonl").diagnoses for part in parts]
+        parts = replace(job, method="bayes", repeat=0), replace(job, method="cnn")
+        files = [_answers(folder, part, VIEWS[view]) for part in parts]
+        stored = [read_results(file).diagnoses for file in files]
         bayes, network = (np.array([[d.posterior[n] for n in names] for d in ds]) for ds in stored)
         return log_pool(bayes, network, PoolWeights(*HYBRID_WEIGHTS))
     if job.method == "kalman":
@@ -227,123 +184,6 @@ def _by_model(robot: Robot, folder: Path, job: RivalJob, test: xr.Dataset) -> Fl
 
 HYBRID_WEIGHTS = (0.8, 0.2)
 """Weights of Bayes and the network in the pool; stated before any test set was scored."""
-
-
-def _by_training(
-    plan: RivalPlan, robot: Robot, folder: Path, job: RivalJob, test: xr.Dataset
-) -> Answer:
-    """Train a method and return what gives its probabilities.
-
-    A tenth of the training runs sets the temperature of the probabilities.
-    """
-    from failuretwin.decision.learned.diagnoser import best_temperature
-    from failuretwin.decision.learned.networks import Standard
-
-    rng = np.random.default_rng([plan.seed, job.repeat])
-    with np.load(folder / f"{job.twin}.npz", allow_pickle=False) as stored:
-        features, classes, target = stored["features"], stored["classes"], stored["test"]
-    order = rng.permutation(len(features))
-    held = round(VALIDATION_SHARE * len(order))
-    learn, judge = order[held:], order[:held]
-    standard = Standard.of(features[learn])
-    features, target = standard(features), standard(target)
-    answer: Answer
-    if job.method in CLASSICAL:
-        from failuretwin.decision.rivals import classical
-
-        model = getattr(classical, CLASSICAL[job.method])(random_state=job.repeat)
-        model.fit(features[learn], classes[learn])
-        logits = partial(_logits, len(class_names(robot)), model)
-        held_out, answer = logits(features[judge]), partial(logits, target)
-    else:
-        truth = np.array([class_names(robot).index(str(f)) for f in test["fault"].values])
-        trainer = _Trainer(plan, robot, job, rng)
-        held_out, answer = trainer.trained(
-            (features[learn], classes[learn]), features[judge], target, truth
-        )
-    temperature = best_temperature(held_out, classes[judge])
-    return lambda: np.asarray(softmax(log_softmax(answer(), axis=1) / temperature, axis=1))
-
-
-def _logits(count: int, model: Any, features: Floats) -> FloatArray:
-    """Return log probabilities of `count` classes, (run, class)."""
-    chances = np.zeros((len(features), count))
-    chances[:, model.classes_] = model.predict_proba(features)
-    return np.asarray(np.log(np.maximum(chances, LEAST)))
-
-
-LEAST = 1e-6
-"""Least probability of a classifier before the temperature: trees and neighbours give zeros."""
-
-
-@dataclass(frozen=True)
-class _Trainer:
-    """Trains the network of one job."""
-
-    plan: RivalPlan
-    robot: Robot
-    job: RivalJob
-    rng: np.random.Generator
-
-    def trained(
-        self, learn: Batch, judge: Floats, target: Floats, truth: IntArray
-    ) -> tuple[FloatArray, Answer]:
-        """Return logits of held-out runs, and what gives those of the target runs.
-
-        `truth` of the target runs is for fine-tuning alone.
-        """
-        import torch
-
-        from failuretwin.decision.learned import networks as own
-        from failuretwin.decision.learned.diagnoser import network_shape
-        from failuretwin.decision.rivals import networks as other
-
-        kind = "robust" if self.job.twin == IMPERFECT else "augmented"
-        encoder = FeatureEncoder(kind, self.robot)
-        shape = network_shape(encoder, target.shape[2], len(class_names(self.robot)))
-        torch.manual_seed(int(self.rng.integers(2**31)))
-        batches = own.shuffled_batches(*learn, BATCH_RUNS, self.rng)
-        name = "cnn" if self.job.method in ADAPTING else self.job.method
-        network: Any = other.build(name, shape)
-        steps = self.plan.iterations, REPRODUCING_RATE
-        if self.job.method == "dann":
-            run = other.adversarial_training(network, batches, target, *steps, self.rng)
-        else:
-            run = own.training(network, batches, *steps)
-        for _ in run:
-            pass
-        answer: Answer = partial(own.scores_of, network, target)
-        if self.job.method == "fine-tuned":
-            answer = partial(self._fine_tuned, network, target, truth)
-        return own.scores_of(network, judge), answer
-
-    def _fine_tuned(self, network: Any, target: Floats, truth: IntArray) -> FloatArray:
-        """Return the logits of each fold by a network that went on learning on the others."""
-        from copy import deepcopy
-
-        from failuretwin.decision.learned import networks as own
-
-        rate, share = FINE_TUNING
-        steps = max(1, round(share * self.plan.iterations))
-        found = np.zeros((len(target), len(class_names(self.robot))))
-        fold_of = folds(truth)
-        for fold in np.unique(fold_of):
-            others, these = fold_of != fold, fold_of == fold
-            tuned = deepcopy(network)
-            batches = own.shuffled_batches(target[others], truth[others], BATCH_RUNS, self.rng)
-            for _ in own.training(tuned, batches, steps if others.any() else 0, rate):
-                pass
-            found[these] = own.scores_of(tuned, target[these])
-        return found
-
-
-def folds(truth: IntArray) -> IntArray:
-    """Return the fold of each run: of every class, consecutive runs stay together."""
-    fold = np.zeros(len(truth), dtype=np.int64)
-    for number in np.unique(truth):
-        places = np.flatnonzero(truth == number)
-        fold[places] = np.arange(len(places)) * FOLDS // len(places)
-    return fold
 
 
 # Figures of a finished study.
@@ -363,8 +203,12 @@ class RivalScores:
         errors: Calibration error of each seed, (seed,).
         gain: Nats a run saved by Bayes, with interval, on the first seed.
         p: Exact McNemar test against Bayes, on the first seed.
-        training_s: Mean training time [s].
-        run_ms: Mean time of a diagnosis [ms].
+        delay_s: Median time from the onset to a first alarm that names the fault, mean over
+            seeds [s]; NaN: none names it. Alarms are judged at `PREFIXES_S` and at the end.
+        alarms: Share of faulty runs whose first alarm names the fault, and of healthy runs with
+            an alarm [%]; means over seeds.
+        training_s: Mean processor time of a training [s].
+        run_ms: Mean processor time of a diagnosis [ms].
     """
 
     method: str
@@ -376,23 +220,25 @@ class RivalScores:
     errors: tuple[float, ...]
     gain: tuple[float, float, float]
     p: float
+    delay_s: float
+    alarms: tuple[float, float]
     training_s: float
     run_ms: float
 
 
 def rival_scores(plan: RivalPlan, folder: Path) -> Iterator[RivalScores]:
     """Yield the figures of each method; paired tests are against Bayes with the calibration."""
-    from failuretwin.decision.evaluation import compare, evaluate
-
     kinds: dict[tuple[str, str], list[RivalJob]] = {}
     for job in rival_jobs(plan):
         kinds.setdefault((job.method, job.twin), []).append(job)
-    answers = folder / ANSWERS
-    bayes = answers / f"bayes_{IMPERFECT}_0.jsonl"
+    truths = Truths.of(load_run_set(folder / TEST))
+    bayes = _answers(folder, RivalJob("bayes", IMPERFECT, 0))
     for (method, twin), jobs in kinds.items():
-        found = [evaluate(answers / f"{job.name}.jsonl") for job in jobs]
-        costs = [json.loads((answers / f"{job.name}.json").read_text("utf-8")) for job in jobs]
-        against = compare(answers / f"{jobs[0].name}.jsonl", bayes)
+        found = [evaluate(_answers(folder, job)) for job in jobs]
+        costs = [json.loads(_cost(folder, job).read_text("utf-8")) for job in jobs]
+        against = compare(_answers(folder, jobs[0]), bayes)
+        live = np.array([_live(folder, job, truths) for job in jobs])
+        delays = live[np.isfinite(live[:, 0]), 0]
         yield RivalScores(
             method,
             twin,
@@ -403,9 +249,19 @@ def rival_scores(plan: RivalPlan, folder: Path) -> Iterator[RivalScores]:
             tuple(math.nan if (c := e.calibration) is None else c.equal.error for e in found),
             (against.gain.mean, *against.gain.interval),
             against.split.p,
+            float(delays.mean()) if len(delays) else math.nan,
+            (float(live[:, 1].mean()), float(live[:, 2].mean())),
             _mean(costs, "training_s"),
             _mean(costs, "run_ms"),
         )
+
+
+def _live(folder: Path, job: RivalJob, truths: Truths) -> list[float]:
+    """Return delay [s], named faults and false alarms [%], as the benchmark's task `live`."""
+    task = TASKS["live"]
+    whole, *parts = [read_results(_answers(folder, job, view)).diagnoses for view in VIEWS]
+    seen = dict(zip(task.parts, parts, strict=True))
+    return [score.value for score in task.score(Judgement(whole, truths, seen))]
 
 
 def _mean(costs: Sequence[dict[str, float]], key: str) -> float:

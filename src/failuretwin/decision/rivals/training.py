@@ -1,0 +1,185 @@
+"""Training of classifiers and networks on the runs of one twin, with one seed."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.special import log_softmax, softmax
+
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.data_knowledge.store import replacing
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, Floats
+from failuretwin.decision.learned.paper_study import (
+    BATCH_RUNS,
+    VALIDATION_SHARE,
+    class_names,
+    in_bfloat16,
+)
+from failuretwin.decision.rivals.plan import (
+    CLASSICAL,
+    IMPERFECT,
+    NETWORKS,
+    RivalJob,
+    RivalPlan,
+)
+from failuretwin.digital_model.robot import Robot
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from failuretwin.decision.learned.networks import Batch
+
+Answer = Callable[[int], FloatArray]
+"""Returns logits or probabilities of the test runs in one of their views, (run, class)."""
+FOLDS = 5
+RATE = 3e-3
+"""First learning rate of the networks; it falls to zero along half a cosine."""
+FINE_TUNING = (1e-4, 0.1)
+"""Learning rate, and iterations as a share of those of the training."""
+
+
+def by_training(
+    plan: RivalPlan, robot: Robot, folder: Path, job: RivalJob, test: xr.Dataset
+) -> Answer:
+    """Train a method and return what gives its probabilities.
+
+    A tenth of the training runs sets the temperature of the probabilities.
+    """
+    from failuretwin.decision.learned.diagnoser import best_temperature
+    from failuretwin.decision.learned.networks import Standard, scores_of
+
+    rng = np.random.default_rng([plan.seed, job.repeat])
+    with np.load(folder / f"{job.twin}.npz", allow_pickle=False) as stored:
+        features, classes, target = stored["features"], stored["classes"], stored["test"]
+    order = rng.permutation(len(features))
+    held = round(VALIDATION_SHARE * len(order))
+    learn, judge = order[held:], order[:held]
+    standard = Standard.of(features[learn])
+    features, target = standard(features), standard(target)
+    logits: Callable[[Floats], FloatArray]
+    if job.method in CLASSICAL:
+        from failuretwin.decision.rivals import classical
+
+        model = getattr(classical, CLASSICAL[job.method])(random_state=job.repeat)
+        model.fit(features[learn], classes[learn])
+        logits = partial(_logits, len(class_names(robot)), model)
+    else:
+        trainer = _Trainer(plan, robot, job, rng, folder)
+        network = trainer.trained((features[learn], classes[learn]), target[0])
+        logits = partial(scores_of, network)
+    if job.method == "fine-tuned":
+        truth = np.array([class_names(robot).index(str(f)) for f in test["fault"].values])
+        answer = trainer.fine_tuned(network, target, truth)
+    else:
+        answer = partial(_seen_by, logits, target)
+    temperature = best_temperature(logits(features[judge]), classes[judge])
+    return lambda view: np.asarray(softmax(log_softmax(answer(view), axis=1) / temperature, axis=1))
+
+
+def _seen_by(logits: Callable[[Floats], FloatArray], target: Floats, view: int) -> FloatArray:
+    return logits(target[view])
+
+
+def _logits(count: int, model: Any, features: Floats) -> FloatArray:
+    """Return log probabilities of `count` classes, (run, class)."""
+    chances = np.zeros((len(features), count))
+    chances[:, model.classes_] = model.predict_proba(features)
+    return np.asarray(np.log(np.maximum(chances, LEAST)))
+
+
+LEAST = 1e-6
+"""Least probability of a classifier before the temperature: trees and neighbours give zeros."""
+
+
+@dataclass(frozen=True)
+class _Trainer:
+    """Trains the network of one job."""
+
+    plan: RivalPlan
+    robot: Robot
+    job: RivalJob
+    rng: np.random.Generator
+    folder: Path
+
+    def trained(self, learn: Batch, target: Floats) -> Any:
+        """Return a trained network, stored unless it adapts; fine-tuning goes on from the CNN."""
+        from failuretwin.decision.rivals.networks import adversarial_training
+
+        network, batches = self._new(learn, len(class_names(self.robot)))
+        if self.job.method == "dann":
+            steps = self.plan.iterations, RATE
+            run = adversarial_training(network, batches, target, *steps, self.rng)
+            deque(in_bfloat16(run), maxlen=0)
+            return network
+        return self._kept(network, batches)
+
+    def _kept(self, network: Any, batches: Iterator[Batch]) -> Any:
+        """Train a network once: load it if it is stored."""
+        import torch
+
+        from failuretwin.decision.learned.networks import training
+
+        kind = self.job.method if self.job.method in NETWORKS else "cnn"
+        stored = self.folder / f"{replace(self.job, method=kind).name}.pt"
+        if stored.is_file():
+            network.load_state_dict(torch.load(stored, weights_only=True))
+            return network
+        run = training(network, batches, self.plan.iterations, RATE, decay=True)
+        deque(in_bfloat16(run), maxlen=0)
+        with replacing(stored) as new:
+            torch.save(network.state_dict(), new)
+        return network
+
+    def _new(self, learn: Batch, classes: int) -> tuple[Any, Iterator[Batch]]:
+        """Return a network with random weights, and its batches."""
+        import torch
+
+        from failuretwin.decision.learned import networks as own
+        from failuretwin.decision.learned.diagnoser import network_shape
+        from failuretwin.decision.rivals import networks as other
+
+        kind = "robust" if self.job.twin == IMPERFECT else "augmented"
+        shape = network_shape(FeatureEncoder(kind, self.robot), learn[0].shape[2], classes)
+        torch.manual_seed(int(self.rng.integers(2**31)))
+        own_kind = self.job.method in NETWORKS
+        network = other.build(self.job.method if own_kind else "cnn", shape)
+        return network, own.shuffled_batches(*learn, BATCH_RUNS, self.rng)
+
+    def fine_tuned(self, network: Any, target: Floats, truth: IntArray) -> Answer:
+        """Return the logits of each fold by a network that went on learning on the others.
+
+        It learns on whole runs, the first view of `target` (view, run, point, channel).
+        """
+        from copy import deepcopy
+
+        from failuretwin.decision.learned import networks as own
+
+        rate, share = FINE_TUNING
+        steps = max(1, round(share * self.plan.iterations))
+        tuned, fold_of = [deepcopy(network) for _ in range(FOLDS)], folds(truth)
+        for fold, one in enumerate(tuned):
+            others = fold_of != fold
+            batches = own.shuffled_batches(target[0, others], truth[others], BATCH_RUNS, self.rng)
+            run = own.training(one, batches, steps if others.any() else 0, rate)
+            deque(in_bfloat16(run), maxlen=0)
+
+        def answer(view: int) -> FloatArray:
+            by_fold = [own.scores_of(one, target[view]) for one in tuned]
+            return np.stack(by_fold)[fold_of, np.arange(len(truth))]
+
+        return answer
+
+
+def folds(truth: IntArray) -> IntArray:
+    """Return the fold of each run: of every class, consecutive runs stay together."""
+    fold = np.zeros(len(truth), dtype=np.int64)
+    for number in np.unique(truth):
+        places = np.flatnonzero(truth == number)
+        fold[places] = np.arange(len(places)) * FOLDS // len(places)
+    return fold
