@@ -71,6 +71,10 @@ def rival_jobs(plan: RivalPlan) -> list[RivalJob]:
         for twin in TWINS:
             names = [*NETWORKS, *ADAPTING, *CLASSICAL, "hybrid"]
             names += [m for m in MODELS if m != "hybrid" and repeat == 0]
-            one_twin = {"motorwise-cnn": IMPERFECT, "hybrid": IMPERFECT, "self-calibrating": PUBLISHED}
+            one_twin = {
+                "motorwise-cnn": IMPERFECT,
+                "hybrid": IMPERFECT,
+                "self-calibrating": PUBLISHED,
+            }
             jobs += [RivalJob(n, twin, repeat) for n in names if one_twin.get(n, twin) == twin]
     return jobs
