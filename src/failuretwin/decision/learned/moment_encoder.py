@@ -12,10 +12,10 @@ of their deviation, so that arms of any size look alike.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +58,7 @@ class Tokens:
     edges: Floats
 
     @property
-    def arrays(self) -> tuple[NDArray[np.generic], ...]:
+    def arrays(self) -> tuple[NDArray[Any], ...]:
         """All arrays, in the order of attributes."""
         return self.features, self.exists, self.anchor, self.edges
 
@@ -68,7 +68,11 @@ class Tokens:
 
     def __getitem__(self, runs: NDArray[np.int64] | slice) -> Tokens:
         """Return some runs."""
-        return Tokens(self.features[runs], self.exists[runs], self.anchor[runs], self.edges[runs])
+        return self._each(lambda values: values[runs])
+
+    def _each(self, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Tokens:
+        """Return the same with every array changed."""
+        return Tokens(*(change(values) for values in self.arrays))
 
     @property
     def lengths(self) -> IntArray:
@@ -78,18 +82,16 @@ class Tokens:
     def cut(self) -> Tokens:
         """Return the same without room that no run needs."""
         most = int(self.lengths.max(initial=1))
-        return Tokens(*(values[:, :most] for values in self.arrays))  # type: ignore[arg-type]
+        return self._each(lambda values: values[:, :most])
 
     def padded(self, moments: int) -> Tokens:
         """Return the same with room for so many moments."""
         more = moments - self.exists.shape[1]
         if more <= 0:
             return self
-
-        def wide(values: NDArray[np.generic]) -> NDArray[np.generic]:
-            return np.pad(values, [(0, 0), (0, more)] + [(0, 0)] * (values.ndim - 2))
-
-        return Tokens(*(wide(values) for values in self.arrays))  # type: ignore[arg-type]
+        return self._each(
+            lambda values: np.pad(values, [(0, 0), (0, more)] + [(0, 0)] * (values.ndim - 2))
+        )
 
     @classmethod
     def joined(cls, parts: Sequence[Tokens]) -> Tokens:
