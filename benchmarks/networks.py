@@ -1,4 +1,4 @@
-"""Networks side by side: same runs, same iterations, several seeds.
+"""Networks of one arm and of four: several seeds, beside Bayes.
 
 Trains what is missing in a folder and scores everything there on simulated runs of the physics
 engine. With --arms, one motor-wise network for the four bundled arms is scored on each of them,
@@ -20,10 +20,7 @@ from failuretwin.core.hypothesis import Diagnosis, paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generate import simulate
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
-from failuretwin.decision.learned.motorwise_diagnoser import NETWORK
-from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import load_network, save_network
-from failuretwin.decision.motorwise_data import PopulationData
 from failuretwin.decision.scoring import (
     log_score,
     log_score_gain,
@@ -31,6 +28,7 @@ from failuretwin.decision.scoring import (
     reliability,
 )
 from failuretwin.decision.training import ARMS, TrainingPlan, train_network
+from failuretwin.decision.training_data import PopulationData
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, calibrated
 from failuretwin.failure_behavior.registry import MODES
 
@@ -38,8 +36,8 @@ PER_CLASS = 223
 """Runs of each class by the physics engine: 2007 in all."""
 POPULATION_RUNS, POPULATION_SEED = 600, 700_001
 """Runs of each arm by the physics engine, of faults of any onset, and their seed."""
-KINDS = (NETWORK, "all_arms", *NETWORKS)
-"""What is trained; all_arms: the motor-wise network for four arms."""
+KINDS = OWN, ALL = ("motorwise", "all_arms")
+"""What is trained; all_arms: one network for four arms."""
 
 
 def train_missing(
@@ -51,8 +49,7 @@ def train_missing(
         for name in kinds:
             path = folder / f"{name}_{seed}.npz"
             if not path.exists():
-                every = name == "all_arms"
-                plan = TrainingPlan(NETWORK if every else name, iterations, seed, all_arms=every)
+                plan = TrainingPlan(iterations, seed, all_arms=name == ALL)
                 diagnoser, found, _ = train_network(plan, known)
                 save_network(diagnoser, path)
                 said = f"{found.accuracy:.4f} right, {found.log_score:.4f} nats a run"
@@ -113,11 +110,11 @@ def print_arms(folder: Path) -> None:
     modes = {name: MODES[name] for name in ("stuck", "steady_state_error")}
     for arm in ARMS:
         known = calibrated(arm)
-        data = PopulationData((known,), modes, POPULATION_SEED, "physics", exact=True)
+        data = PopulationData((known,), modes, POPULATION_SEED, "physics", widening=(1.0,))
         runs = data.run_set(0, POPULATION_RUNS)
-        files = [*folder.glob("all_arms_*.npz"), *folder.glob(f"{arm}_*.npz")]
+        files = [*folder.glob(f"{ALL}_*.npz"), *folder.glob(f"{arm}_*.npz")]
         if arm == "armpi_fpv":
-            files += folder.glob(f"{NETWORK}_*.npz")
+            files += folder.glob(f"{OWN}_*.npz")
         said = {path.stem: load_network(path, known).diagnose(runs) for path in sorted(files)}
         said = {"bayes": BayesDiagnoser(known).diagnose(runs), **said}
         print_networks(said, f"{POPULATION_RUNS} runs of {arm}, faults of any onset")

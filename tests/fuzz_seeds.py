@@ -28,7 +28,7 @@ from failuretwin.data_knowledge.step_tests import read_step_test
 from failuretwin.data_knowledge.store import save_run_set
 from failuretwin.decision.results import read_results
 from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.digital_model.nonidealities import Imperfections, Schedule
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections, Schedule
 from failuretwin.digital_model.robot import bundled_folder
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.digital_model.urdf.check import check_urdf
@@ -276,13 +276,13 @@ def step_test(folder):
 
 
 def network(folder):
-    from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
-    from failuretwin.decision.learned.feature_encoder import FeatureEncoder
+    from failuretwin.decision.learned.diagnoser import MotorwiseDiagnoser
+    from failuretwin.decision.learned.moment_encoder import MomentEncoder
     from failuretwin.decision.learned.storage import save_network
 
-    encoder = FeatureEncoder("robust", ARMPI, None)
+    encoder = MomentEncoder(ARMPI, NO_IMPERFECTIONS)
     hypotheses = parse_hypotheses(["healthy", "motor_1:stuck"], ARMPI.motor_names)
-    diagnoser = LearnedDiagnoser("lstm", encoder, iterations=1, random_state=1)
+    diagnoser = MotorwiseDiagnoser(encoder, iterations=1, random_state=1)
     diagnoser.fit(simulate(Plan(ARMPI, hypotheses, 4, 2)))
     save_network(diagnoser, folder / "network.npz")
     return folder / "network.npz"

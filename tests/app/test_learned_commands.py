@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from failuretwin import BayesDiagnoser, load_robot, read_runs
 from failuretwin.app.cli import cli
 from failuretwin.core.errors import FailureTwinError, InputError
-from failuretwin.decision import motorwise_data, training
+from failuretwin.decision import training, training_data
 from failuretwin.decision.learned.log_pool import log_pool
 from failuretwin.decision.learned.storage import load_network, save_network
 
@@ -28,7 +28,7 @@ def network(tmp_path_factory):
     path = tmp_path_factory.mktemp("network") / "network.npz"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "TrainingPlan", partial(training.TrainingPlan, validation_runs=18))
-        patch.setattr(motorwise_data, "CHUNK_RUNS", 96)
+        patch.setattr(training_data, "CHUNK_RUNS", 96)
         answer = run("train", "--out", path, "--iterations", 4, "--seed", 3)
     return path, answer.output
 
@@ -55,7 +55,7 @@ def test_a_network_diagnoses_as_bayes_does(failuretwin, network, simulated, tmp_
     got = [list(record["posterior"].values()) for record in records]
     np.testing.assert_allclose(got, expected, atol=1e-6)  # single precision
     assert {record["protocol"] for record in records} == {"P0c"}
-    assert "network motorwise" in records[0]["method"]
+    assert "network; healthy" in records[0]["method"]
     assert "of 9 runs right" in answer.stdout
 
 
@@ -104,7 +104,7 @@ def test_methods_that_cannot_be_used_are_refused(network, simulated, arguments, 
     [
         (["--out", "network.pt"], "ends in .npz"),
         (["--out", "nowhere/network.npz"], "does not exist"),
-        (["--out", "network.npz", "--network", "lstms"], "is not one of"),
+        (["--out", "network.npz", "--device", "gpu"], "is not one of"),
         (["--out", "network.npz", "--calibration", "none.toml"], "none.toml"),
     ],
 )

@@ -8,8 +8,7 @@ from failuretwin.app.commands.learn import train as command
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.decision import motorwise_data as stream_module
-from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of
+from failuretwin.decision import training_data as stream_module
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.decision.learned.networks import (
     NETWORKS,
@@ -21,9 +20,9 @@ from failuretwin.decision.learned.networks import (
     training,
 )
 from failuretwin.decision.training import TrainingPlan, train
-from failuretwin.decision.training_data import VARIANTS, TrainingData, widened
+from failuretwin.decision.training_data import KINDS, widened
 
-SHAPE = Shape(channels=10, classes=3, motors=2, shared=2)
+SHAPE = Shape(channels=10, classes=3)
 ALL = pytest.mark.parametrize("name", list(NETWORKS))
 
 
@@ -123,39 +122,10 @@ def test_standardised_channels_have_unit_spread():
     np.testing.assert_allclose(made.std(axis=(0, 1)), [1.0, 1.0, 1.0, 0.0], atol=1e-5)
 
 
-@pytest.fixture(scope="module")
-def training_data(armpi, measured_armpi):
-    return TrainingData(armpi, measured_armpi, seed=4)
-
-
-def test_chunks_depend_on_seed_and_number_alone(armpi, measured_armpi, training_data):
-    encoder = FeatureEncoder("robust", armpi, expectation_of(armpi, measured_armpi))
-    first, classes = training_data.chunk(0, 12, encoder)
-    again, same = TrainingData(armpi, measured_armpi, seed=4).chunk(0, 12, encoder)
-    np.testing.assert_array_equal(first, again)
-    np.testing.assert_array_equal(classes, same)
-    assert not np.array_equal(first, training_data.chunk(1, 12, encoder)[0])
-    assert not np.array_equal(
-        first, TrainingData(armpi, measured_armpi, 5).chunk(0, 12, encoder)[0]
-    )
-
-
-def test_classes_stay_with_their_runs(armpi, training_data):
-    """A stuck motor 1 is seen in plain features: its angle at the tool never changes."""
-    features, classes = training_data.chunk(0, 180, FeatureEncoder("original", armpi))
-    late = features[:, 30:, 4:]
-    azimuth = np.arctan2(late[..., 0], -late[..., 1])
-    # On a line through the axis: the azimuth is one angle or the one opposite.
-    spread = np.abs(np.mean(np.exp(2j * azimuth), axis=1))
-    assert np.median(spread[classes == 1]) > 0.99
-    assert np.median(spread[classes != 1]) < 0.9
-    assert set(classes) == set(range(9))
-
-
 def test_small_errors_come_most_often():
-    small = [v for v in VARIANTS if v.error_counts[0] <= 5.0]
-    assert len(small) > len(VARIANTS) / 2
-    assert (10.0, 50.0) in [v.error_counts for v in VARIANTS]  # the paper's
+    small = [kind for kind in KINDS if kind.error_counts[0] <= 5.0]
+    assert len(small) > len(KINDS) / 2
+    assert (10.0, 50.0) in [kind.error_counts for kind in KINDS]  # the paper's
 
 
 def test_widened_robots_differ_more(armpi):
@@ -181,5 +151,4 @@ def test_a_network_is_trained_and_pooled_with_bayes_in_one_call(armpi, measured_
 
 def test_the_command_trains_as_much_as_python_does():
     given = {option.name: option.default for option in command.params}
-    assert (given["network"], given["iterations"]) == ("motorwise", 6000)
-    assert (TrainingPlan().network, TrainingPlan().iterations) == ("motorwise", 6000)
+    assert given["iterations"] == TrainingPlan().iterations == 6000

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import copy
+import itertools
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -14,21 +16,23 @@ from failuretwin import load_robot
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.decision import training_data as stream_module
+from failuretwin.decision.learned.diagnoser import (
+    MotorwiseDiagnoser,
+    best_temperature,
+    check_modes,
+)
+from failuretwin.decision.learned.estimates import Onset, Size, fitted_factor
 from failuretwin.decision.learned.labels import Labels
 from failuretwin.decision.learned.moment_encoder import MomentEncoder, Tokens
 from failuretwin.decision.learned.motorwise import onset_bins
-from failuretwin.decision.learned.motorwise_diagnoser import (
-    MotorwiseDiagnoser,
-    check_modes,
-    conformal_spread,
-    mixture_quantiles,
-)
 from failuretwin.decision.learned.networks import device_of
 from failuretwin.decision.learned.storage import export_onnx, load_network, save_network
-from failuretwin.decision.motorwise_data import PopulationData, PopulationStream
+from failuretwin.decision.training_data import PopulationData, PopulationStream
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, calibrated
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.failure_behavior.registry import MODES
+from user_modes import code_on_the_page, registered_from
 
 PAPER_MODES = {mode: MODES[mode] for mode in ("stuck", "steady_state_error")}
 BUNDLED = ("armpi_fpv", "so101", "ur5e", "panda")
@@ -149,7 +153,7 @@ def test_quantiles_of_a_sum_of_normals_hold_their_share():
     share, mean, deviation = np.array([0.3, 0.7]), np.array([-1.0, 2.0]), np.array([0.5, 1.5])
     which = rng.choice(2, 200_000, p=share)
     drawn = rng.normal(mean[which], deviation[which])
-    found = mixture_quantiles(share, mean, deviation)
+    found = Size(share, mean, deviation).quantiles()
     np.testing.assert_allclose(found, np.quantile(drawn, [0.05, 0.5, 0.95]), atol=0.02)
 
 
@@ -169,7 +173,7 @@ def test_it_follows_the_protocol_of_scikit_learn(trained, runs):
     ("change", "words"),
     [
         (lambda runs: runs.drop_vars("onset"), "lacks onset"),
-        (lambda runs: np.zeros((3, 4)), "not from arrays"),
+        (lambda runs: np.zeros((3, 4)), "not arrays"),
         (lambda runs: runs.assign(fault=("run", ["motor_1:drift"] * runs.sizes["run"])), "drift"),
     ],
 )
@@ -221,7 +225,7 @@ def test_hypotheses_are_each_mode_at_each_motor(armpi):
     told = ["healthy", *(f"{n}:drift" for n in names), *(f"{n}:stuck" for n in names)]
     assert check_modes(told, armpi) == ("drift", "stuck")
     for wrong in (["healthy", "motor_1:stuck"], [*told, "motor_1:stuck+motor_2:stuck"]):
-        with pytest.raises(InputError, match="another --network"):
+        with pytest.raises(InputError, match="each mode at each motor"):
             check_modes(wrong, armpi)
 
 
@@ -270,7 +274,7 @@ def population(armpi, measured_armpi):
     stream = PopulationStream(data, network.batch_of, uses=6)
     batches = list(stream.batches(iter(chunks)))[-500:]
     network.fit_batches(batches, [chunks[0][0]], (3, 8), ["armpi_fpv"])
-    exam = replace(data, seed=12, exact=True)
+    exam = replace(data, seed=12, widening=(1.0,))
     return network, exam.run_set(0, 900)
 
 
@@ -304,8 +308,68 @@ def test_sizes_are_widened_until_their_intervals_hold():
     """Deviations that are half of what they should be."""
     rng = np.random.default_rng(0)
     one = np.ones(1)
-    held = [(float(x), one, 0.0 * one, 0.5 * one) for x in rng.standard_normal(4000)]
-    assert conformal_spread(held) == pytest.approx(2.0, rel=0.08)
+    held = [(float(x), Size(one, 0.0 * one, 0.5 * one)) for x in rng.standard_normal(4000)]
+    assert fitted_factor(held, narrower=False) == pytest.approx(2.0, rel=0.08)
+    assert fitted_factor(held[:5], narrower=False) == 1.0
+
+
+def test_onsets_are_sharpened_until_their_intervals_hold():
+    """Shares that are the square roots of what they should be, normalised."""
+    rng = np.random.default_rng(0)
+    edges = np.linspace(-4.0, 4.0, 81)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    said = Onset(edges[:-1], edges[1:], np.exp(-0.25 * middle**2)).powered(1.0)
+    held = [(float(x), said) for x in rng.standard_normal(2000)]
+    assert fitted_factor(held, narrower=True) == pytest.approx(2.0, rel=0.12)
+    low, half, high = said.powered(2.0).quantiles()
+    np.testing.assert_allclose((low, half, high), (-1.645, 0.0, 1.645), atol=0.02)
+
+
+def test_intervals_are_calibrated_by_robot_and_change_no_verdict(trained, runs, armpi):
+    other = copy.copy(trained).calibrate_intervals(test_set(armpi, NO_IMPERFECTIONS, 12))
+    assert set(other.widths_) == {"armpi_fpv"}
+    assert trained.widths_ == {}
+    np.testing.assert_array_equal(other.predict_proba(runs), trained.predict_proba(runs))
+    panda = calibrated("panda")
+    strange = other.for_robot(MomentEncoder(panda.robot, panda.imperfections))
+    assert strange._widths == other.widths_["armpi_fpv"]
+
+
+def test_temperature_of_scores_that_are_too_sure():
+    """Scores three times the logs of honest chances need a temperature of three."""
+    rng = np.random.default_rng(0)
+    chances = rng.dirichlet([0.5] * 4, 4000)
+    truth = np.array([rng.choice(4, p=p) for p in chances])
+    assert best_temperature(3.0 * np.log(chances + 1e-12), truth) == pytest.approx(3.0, rel=0.1)
+
+
+def test_calibration_on_unknown_classes_is_refused(runs, trained):
+    with pytest.raises(InputError, match="does not know motor_9:stuck"):
+        trained.calibrate(runs, ["motor_9:stuck"] * runs.sizes["run"])
+
+
+@pytest.mark.parametrize("wrong", [{"iterations": 0}, {"batch_runs": 0}])
+def test_learning_from_nothing_is_refused(encoder, runs, wrong):
+    with pytest.raises(InputError, match="Expected one at least"):
+        MotorwiseDiagnoser(encoder, **wrong).fit(runs)
+
+
+def test_fresh_runs_come_from_other_processes_in_order(
+    armpi, measured_armpi, monkeypatch, tmp_path
+):
+    """Runs of a mode that a user has registered, too."""
+    monkeypatch.setattr(stream_module, "CHUNK_RUNS", 18)
+    known = CalibratedRobot(armpi, measured_armpi)
+    with registered_from(code_on_the_page(), tmp_path, "shaft_to_learn"):
+        data = PopulationData((known,), {"bent_shaft": MODES["bent_shaft"]}, 3)
+        stream = PopulationStream(data, lambda tokens, labels: None)
+        with closing(stream.chunks()) as chunks:
+            streamed = list(itertools.islice(chunks, 2))
+        expected = [data.chunk(number, 18) for number in range(2)]
+    for (tokens, labels), (same_tokens, same_labels) in zip(streamed, expected, strict=True):
+        np.testing.assert_array_equal(tokens.features, same_tokens.features)
+        np.testing.assert_array_equal(labels.mode, same_labels.mode)
+        assert set(labels.mode) == {-1, 0}
 
 
 def test_runs_of_an_unknown_kind_are_told(runs, trained):
@@ -313,3 +377,5 @@ def test_runs_of_an_unknown_kind_are_told(runs, trained):
     short = runs.isel(run=[0], time=slice(0, 450))[["command", "measured"]]
     (diagnosis,) = trained.diagnose(short)
     assert any("learned from runs of 5" in remark for remark in diagnosis.quality)
+    (whole,) = trained.diagnose(runs.isel(run=[0]))
+    assert not any("learned from runs" in remark for remark in whole.quality)

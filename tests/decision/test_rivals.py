@@ -20,7 +20,7 @@ from failuretwin.decision.rivals.training import folds
 from failuretwin.digital_model.twin import DigitalTwin
 
 TINY = RivalPlan(0, 4, 2, 1, 2)
-SOME = ("cnn", "dann", "fine-tuned", "nearest", "bayes", "hybrid")
+SOME = ("cnn", "motorwise", "dann", "fine-tuned", "nearest", "bayes", "hybrid")
 """Methods of the small study: one of each way that a job can go."""
 
 

@@ -36,7 +36,7 @@ from failuretwin.inference.set_ups.log_correction import CorrectionTable, LogCor
 if TYPE_CHECKING:
     import xarray as xr
 
-    from failuretwin.decision.learned.diagnoser import NetworkDiagnoser
+    from failuretwin.decision.learned.diagnoser import MotorwiseDiagnoser
 
 
 def read_inputs(
@@ -230,7 +230,7 @@ def _told_robot(bayes: BayesDiagnoser) -> Robot | CalibratedRobot:
     return CalibratedRobot(robot, told)
 
 
-def _pooled(network: NetworkDiagnoser, bayes: BayesDiagnoser, path: Path) -> HybridDiagnoser:
+def _pooled(network: MotorwiseDiagnoser, bayes: BayesDiagnoser, path: Path) -> HybridDiagnoser:
     if network.weights_ is None:
         raise InputError(
             f"{path}: how it weighs beside Bayes was never fitted. Train it "

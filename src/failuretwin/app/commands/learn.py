@@ -138,13 +138,6 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str, robot: opt.Robot
 
 @click.command()
 @opt.file_option("--out", "MODEL", "Network to write (.npz).", required=True)
-@click.option(
-    "--network",
-    type=click.Choice(["motorwise", "cnn", "lstm"]),
-    default="motorwise",
-    help="motorwise: the same network for every motor of any arm. cnn: convolutional. lstm: the "
-    "paper's.",
-)
 @opt.flag_option("--all-arms", "Learn from all bundled arms: one network for any of them.")
 @click.option(
     "--device",
@@ -161,7 +154,6 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str, robot: opt.Robot
 @opt.calibrated_robot_options()
 def train(
     out: Path,
-    network: str,
     all_arms: bool,
     device: str,
     iterations: int,
@@ -184,9 +176,7 @@ def train(
     check_writable(out)
     known = robot.known
     chosen = parse_cli_hypotheses(hypotheses, robot.model)
-    plan = TrainingPlan(
-        network, iterations, robot.seed, hypotheses=chosen, all_arms=all_arms, device=device
-    )
+    plan = TrainingPlan(iterations, robot.seed, hypotheses=chosen, all_arms=all_arms, device=device)
     with progress_bar("training", iterations) as advance:
         diagnoser, alone, both = train_network(plan, known, lambda done: advance(1))
     save_network(diagnoser, out)

@@ -37,14 +37,10 @@ class Shape:
     Attributes:
         channels: Channels of each point.
         classes: Number of classes.
-        motors: Motors with equally many channels each, which come first.
-        shared: Channels after those, which belong to no motor.
     """
 
     channels: int
     classes: int
-    motors: int = 1
-    shared: int = 0
 
 
 class PaperLstm(nn.Module):
@@ -83,21 +79,16 @@ def _initialise_as_published(layer: nn.LSTM) -> None:
     nn.init.ones_(weights["bias_ih_l0"][HIDDEN : 2 * HIDDEN])
 
 
-def convolutions(channels: int, wide: int, *, bias: bool = True) -> nn.ModuleList:
-    """Return four convolutions over time."""
-    return nn.ModuleList(
-        nn.Conv1d(taken, wide, KERNEL, stride=stride, padding=KERNEL // 2, bias=bias)
-        for taken, stride in zip((channels, wide, wide, wide), STRIDES, strict=True)
-    )
-
-
 class Cnn(nn.Module):
     """Four convolutions over time, mean and maximum over time, one hidden layer."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
         wide = CNN_WIDTH
-        self.convolutions = convolutions(shape.channels, wide)
+        self.convolutions = nn.ModuleList(
+            nn.Conv1d(taken, wide, KERNEL, stride=stride, padding=KERNEL // 2)
+            for taken, stride in zip((shape.channels, wide, wide, wide), STRIDES, strict=True)
+        )
         self.dropout = nn.Dropout(DROPOUT)
         self.hidden = nn.Linear(2 * wide, wide)
         self.dense = nn.Linear(wide, shape.classes)

@@ -18,7 +18,6 @@ from failuretwin.decision.learned.networks import (
     Cnn,
     Shape,
     build_network,
-    convolutions,
     shuffled_batches,
 )
 
@@ -72,43 +71,9 @@ class Transformer(nn.Module):
         return self.dense(self.layers(tokens + self.position).mean(dim=1))
 
 
-class MotorWise(nn.Module):
-    """CNN whose convolutions share their weights between motors.
-
-    Each motor also receives the mean over all motors; only the last layers are motor-specific.
-    """
-
-    def __init__(self, shape: Shape) -> None:
-        super().__init__()
-        self.motors, self.shared = shape.motors, shape.shared
-        self.each = (shape.channels - shape.shared) // shape.motors
-        wide = WIDTH
-        self.own = convolutions(self.each + shape.shared, wide)
-        self.all = convolutions(self.each + shape.shared, wide, bias=False)
-        self.dropout = nn.Dropout(DROPOUT)
-        self.hidden = nn.Linear(2 * wide * shape.motors, 2 * wide)
-        self.dense = nn.Linear(2 * wide, shape.classes)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return logits (run, class)."""
-        motor, common = torch.split(x, [self.motors * self.each, self.shared], dim=2)
-        motor = torch.unflatten(motor, 2, (self.motors, self.each))
-        common = common.unsqueeze(2).repeat(1, 1, self.motors, 1)
-        x = torch.cat([motor, common], dim=3).permute(0, 2, 3, 1)  # run, motor, channel, point
-        for own_part, all_part in zip(self.own, self.all, strict=True):
-            each = own_part(x.flatten(0, 1)).unflatten(0, (-1, self.motors))
-            x = torch.relu(each + all_part(x.mean(dim=1)).unsqueeze(1))
-        seen = torch.cat([x.mean(dim=3), x.amax(dim=3)], dim=2).flatten(1)
-        return self.dense(self.dropout(torch.relu(self.hidden(seen))))
-
-
 def build(name: str, shape: Shape) -> nn.Module:
     """Return a new network of this package or of others."""
-    own: dict[str, type[nn.Module]] = {
-        "tcn": Tcn,
-        "transformer": Transformer,
-        "motorwise-cnn": MotorWise,
-    }
+    own: dict[str, type[nn.Module]] = {"tcn": Tcn, "transformer": Transformer}
     return own[name](shape) if name in own else build_network(name, shape)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 PUBLISHED, IMPERFECT = TWINS = ("published", "imperfect")
-NETWORKS = ("lstm", "cnn", "tcn", "transformer", "motorwise-cnn")
+NETWORKS = ("lstm", "cnn", "tcn", "transformer")
 ADAPTING = {"dann": "P1", "fine-tuned": "P2"}
 """CNNs that learn from target runs, with the protocol letter."""
 CLASSICAL = {
@@ -13,10 +13,12 @@ CLASSICAL = {
     "boosting": "GradientBoosting",
     "nearest": "NearestSimulation",
 }
+OWN = "motorwise"
+"""Our network."""
 MODELS = ("kalman", "bayes", "self-calibrating", "hybrid")
-"""Methods without training, and the hybrid, which pools one of them with the CNN of its seed."""
+"""Methods without training, and the hybrid, which pools Bayes with our network of its seed."""
 LATE = ("fine-tuned", "hybrid")
-"""Methods that go on from the CNN of their seed."""
+"""Methods that go on from a network of their seed."""
 
 
 @dataclass(frozen=True)
@@ -69,12 +71,8 @@ def rival_jobs(plan: RivalPlan) -> list[RivalJob]:
     jobs = []
     for repeat in range(plan.repeats):
         for twin in TWINS:
-            names = [*NETWORKS, *ADAPTING, *CLASSICAL, "hybrid"]
+            names = [*NETWORKS, OWN, *ADAPTING, *CLASSICAL, "hybrid"]
             names += [m for m in MODELS if m != "hybrid" and repeat == 0]
-            one_twin = {
-                "motorwise-cnn": IMPERFECT,
-                "hybrid": IMPERFECT,
-                "self-calibrating": PUBLISHED,
-            }
+            one_twin = {OWN: IMPERFECT, "hybrid": IMPERFECT, "self-calibrating": PUBLISHED}
             jobs += [RivalJob(n, twin, repeat) for n in names if one_twin.get(n, twin) == twin]
     return jobs

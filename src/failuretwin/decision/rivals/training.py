@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,8 +13,8 @@ import numpy as np
 from scipy.special import log_softmax, softmax
 
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.learned.feature_encoder import FeatureEncoder, Floats
+from failuretwin.data_knowledge.store import load_run_set, replacing
+from failuretwin.decision.learned.feature_encoder import Floats
 from failuretwin.decision.learned.paper_study import (
     BATCH_RUNS,
     VALIDATION_SHARE,
@@ -23,11 +23,11 @@ from failuretwin.decision.learned.paper_study import (
 )
 from failuretwin.decision.rivals.plan import (
     CLASSICAL,
-    IMPERFECT,
     NETWORKS,
     RivalJob,
     RivalPlan,
 )
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 Answer = Callable[[int], FloatArray]
 """Returns logits or probabilities of the test runs in one of their views, (run, class)."""
+LEARNT = "imperfect.nc"
+"""Training runs of the imperfect twin."""
 FOLDS = 5
 RATE = 3e-3
 """First learning rate of the networks; it falls to zero along half a cosine."""
@@ -80,6 +82,29 @@ def by_training(
         answer = partial(_seen_by, logits, target)
     temperature = best_temperature(logits(features[judge]), classes[judge])
     return lambda view: np.asarray(softmax(log_softmax(answer(view), axis=1) / temperature, axis=1))
+
+
+def by_own_network(
+    plan: RivalPlan,
+    known: CalibratedRobot,
+    folder: Path,
+    job: RivalJob,
+    views: Sequence[xr.Dataset],
+) -> Answer:
+    """Train our network on the same runs, as often, and return what gives its probabilities."""
+    from failuretwin.decision.learned.diagnoser import MotorwiseDiagnoser
+    from failuretwin.decision.learned.moment_encoder import MomentEncoder
+
+    runs = load_run_set(folder / LEARNT)
+    order = np.random.default_rng([plan.seed, job.repeat]).permutation(runs.sizes["run"])
+    held = round(VALIDATION_SHARE * len(order))
+    encoder = MomentEncoder(known.robot, known.imperfections)
+    network = MotorwiseDiagnoser(
+        encoder, iterations=plan.iterations, batch_runs=BATCH_RUNS, random_state=job.repeat
+    )
+    network.fit(runs.isel(run=order[held:])).calibrate(runs.isel(run=order[:held]))
+    places = [network.classes_.tolist().index(name) for name in class_names(known.robot)]
+    return lambda view: network.predict_proba(views[view])[:, places]
 
 
 def _seen_by(logits: Callable[[Floats], FloatArray], target: Floats, view: int) -> FloatArray:
@@ -141,11 +166,9 @@ class _Trainer:
         import torch
 
         from failuretwin.decision.learned import networks as own
-        from failuretwin.decision.learned.diagnoser import network_shape
         from failuretwin.decision.rivals import networks as other
 
-        kind = "robust" if self.job.twin == IMPERFECT else "augmented"
-        shape = network_shape(FeatureEncoder(kind, self.robot), learn[0].shape[2], classes)
+        shape = own.Shape(learn[0].shape[2], classes)
         torch.manual_seed(int(self.rng.integers(2**31)))
         own_kind = self.job.method in NETWORKS
         network = other.build(self.job.method if own_kind else "cnn", shape)
