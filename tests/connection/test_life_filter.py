@@ -110,7 +110,7 @@ def said_of_scatter(robot, evidence, factor=1.0, motor=0):
     likelihood, layout = RunLikelihood(evidence, model), Layout(4, geometry=False)
     known = Components.normal_of(np.diag(np.full(layout.size, 1e-12)), model.path_noise)
     place = np.zeros((len(evidence.usable), 7))
-    weighing = Weighing(likelihood, [HEALTHY], Priors(), layout, known, place)
+    weighing = Weighing(likelihood, [HEALTHY], Priors(load_changes=0.0), layout, known, place)
     (part,) = theta_parts(weighing.evidence)
     order = np.argsort(part.picks.run)
     score = scatter_information(weighing.evidence, part).score[order]

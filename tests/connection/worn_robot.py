@@ -31,7 +31,7 @@ SETTLING = Settling(
 DOUBT = Variation(bias=(0.001,) * 4, compliance=(0.05,) * 4, friction=(0.001,) * 4)
 READINGS = Readings(rate_hz=10.0, noise_m=NOISE_M)
 CALIBRATION = Imperfections("made up", "test", "P0c", SETTLING, readings=READINGS, variation=DOUBT)
-KNOWN = Priors(setup=SetupPrior.known())
+KNOWN = Priors(setup=SetupPrior.known(), load_changes=0.0)
 
 
 def normal(calibration=CALIBRATION):

@@ -36,7 +36,7 @@ from failuretwin.inference.together.belief import mixed as moments_of
 from failuretwin.inference.together.belief import positive
 from failuretwin.inference.together.folder_posterior import folder_posterior
 
-SURE = Priors(setup=SetupPrior.known())
+SURE = Priors(load_changes=0.0, setup=SetupPrior.known())
 USUAL = Priors()
 KNOWN = Imperfections("made up", "test", settling=replace(SETTLING, tail_dof=5.0))
 HEALTHY = [Hypothesis.parse("healthy")]

@@ -196,7 +196,7 @@ def fit_settling(observations: Observations) -> SettlingFit:
         evidence = replace(evidence, usable=known)
     likelihood = RunLikelihood(evidence, model)
     layout = Layout(len(model.scatter), geometry=False)
-    priors = Priors(setup=SetupPrior.known())
+    priors = Priors(setup=SetupPrior.known(), load_changes=0.0)
     believed = robot_components(model, layout, AS_TOLD)
     unit = believed.usual_deviation
     base = Belief.of(believed, unit)

@@ -80,7 +80,7 @@ def checking(model: HealthyModel, hypotheses: Sequence[Hypothesis]) -> Priors:
     profile states the least, ranges of errors begin at half of that, in even steps of the
     logarithm; elsewhere at a sixth of what one settled position shows.
     """
-    plain = Priors(error_ranges=_error_ranges(model))
+    plain = Priors(error_ranges=_error_ranges(model), load_changes=0.0)
     prior = np.exp(log_prior(hypotheses, plain))
     own = sum(prior[i] for i, h in enumerate(hypotheses) if h.is_healthy)
     if not 0.0 < own < 1.0:

@@ -140,21 +140,6 @@ class Scene:
         """Settled angles where every command arrives, (run, moment, motor) [rad]."""
         return self.pose[:, :, 0]
 
-    def healthy_rows(self) -> Rows:
-        """Return the one row of a healthy robot."""
-        runs, count, channels = self.moments.point.shape
-        return Rows(
-            np.zeros((runs, 1)),
-            np.array([count]),
-            self.healthy.with_rows(),
-            self.moments.log_weight[:, None],
-            np.arange(self.moments.log_weight.shape[-1]),
-            self.columns[:, None],
-            np.zeros((runs, 1, count, channels)),
-            np.zeros((runs, 1)),
-            np.zeros((runs, 1)),
-        )
-
 
 def sampled(onset: FloatArray, share: FloatArray) -> Onsets:
     """Return the onsets of rows that each have samples of their own, whatever their amount.

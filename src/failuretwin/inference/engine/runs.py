@@ -23,6 +23,7 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.filter import RowsPosterior
+from failuretwin.inference.engine.healthy_rows import healthy_rows
 from failuretwin.inference.engine.held_rows import held_rows
 from failuretwin.inference.engine.offset_rows import offset_rows
 from failuretwin.inference.engine.picks import Part, Picks, Prepared, narrowed, prepared
@@ -94,7 +95,7 @@ def has_rows(hypothesis: Hypothesis) -> bool:
 def rows_of(scene: Scene, hypothesis: Hypothesis) -> Rows:
     """Return the rows of a hypothesis that has some."""
     if hypothesis.is_healthy:
-        return scene.healthy_rows()
+        return healthy_rows(scene)
     fault = hypothesis.faults[0]
     motor, mode = scene.model.motor_names.index(fault.motor), MODES[fault.mode]
     if mode.signature is Signature.HELD:

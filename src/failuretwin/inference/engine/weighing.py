@@ -21,6 +21,7 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.inference.engine.healthy_rows import changes
 from failuretwin.inference.engine.moments import moments_of
 from failuretwin.inference.engine.posterior import (
     marginal_likelihoods as engine_likelihoods,
@@ -264,7 +265,28 @@ class Weighing:
             said.append(
                 f"the sensor seems noisier than is known of it: by about {noise:.2g} mm; judged so"
             )
+        if self._loaded[run]:
+            said.append(self._loaded[run])
         return "; ".join(said)
+
+    @cached_property
+    def _loaded(self) -> list[str]:
+        """What each run says of a load that the tool picked up or set down; empty: nothing."""
+        evidence = self.evidence
+        said = [""] * evidence.scene.moments.runs
+        whole = log_sum(evidence.by_hypothesis + evidence.log_odds, axis=1)
+        for h in np.flatnonzero([one.is_healthy for one in evidence.hypotheses]).tolist():
+            one = evidence.weighed[h]
+            share = np.exp(evidence.height(h) - whole[one.picks.run]) * (one.picks.row > 0)
+            total = np.bincount(one.picks.run, share, len(said))
+            for run in np.flatnonzero(total > TOLD).tolist():
+                best = int(np.argmax(np.where(one.picks.run == run, share, -1.0)))
+                loaded = changes(evidence.scene.moments.count)[one.picks.row[best]]
+                at = evidence.scene.moments.start[run, int(np.flatnonzero(np.diff(loaded))[0]) + 1]
+                when = f"until about {at:.1f} s" if loaded[0] else f"from about {at:.1f} s on"
+                mass = one.amount[best, 0]
+                said[run] = f"the tool seems to carry about {mass:.2g} kg {when}; judged so"
+        return said
 
     def _distance_mm(self, run: int) -> float:
         """Return how far the sensor's frame moves the tool of a run in the mean [mm]."""

@@ -206,6 +206,8 @@ class Priors:
         setup: How far the set-up of the sensor may be off.
         fault_factors: How many times as probable a fault is as its mode says, by
             ``MOTOR:MODE``; faults that are left out: as their mode says.
+        load_changes: Share of runs in which a healthy arm picks up a load or sets one down;
+            assumed. 0: never.
 
     Raises:
         InputError: If there is no range, or one or the odds make no sense.
@@ -216,6 +218,7 @@ class Priors:
     healthy_odds: float = 1.0
     setup: SetupPrior = field(default_factory=SetupPrior)
     fault_factors: Mapping[str, float] = field(default_factory=dict)
+    load_changes: float = 0.03
 
     def __post_init__(self) -> None:
         for ranges in self._stated:
@@ -225,6 +228,10 @@ class Priors:
                 )
         if not 0.0 < self.healthy_odds < np.inf:
             raise InputError(f"healthy_odds are {self.healthy_odds:g}, expected above 0.")
+        if not 0.0 <= self.load_changes < 1.0:
+            raise InputError(
+                f"load_changes are {self.load_changes:g}, expected 0 or more, below 1."
+            )
 
     def factor_of(self, hypothesis: Hypothesis) -> float:
         """Return how many times as probable a hypothesis is as its modes say."""
