@@ -171,7 +171,8 @@ class MotorwiseDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
                 size = labels.size[run]
                 if not is_angle(name):
                     size = np.log(max(abs(size), 1e-9))
-                onsets.append((float(labels.onset[run]), Onset.of(*at)))
+                if labels.onset[run] > 0.0:  # one before the run has a bin of its own
+                    onsets.append((float(labels.onset[run]), Onset.of(*at)))
                 sizes.append((float(size), Size.of(*at, angle=is_angle(name))))
             power = fitted_factor(onsets, narrower=True)
             widths.append((power, fitted_factor(sizes, narrower=False)))
