@@ -29,7 +29,8 @@ def network(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "TrainingPlan", partial(training.TrainingPlan, validation_runs=18))
         patch.setattr(training_data, "CHUNK_RUNS", 96)
-        answer = run("train", "--out", path, "--iterations", 4, "--seed", 3)
+        onnx = path.with_suffix(".onnx")
+        answer = run("train", "--out", path, "--onnx", onnx, "--iterations", 4, "--seed", 3)
     return path, answer.output
 
 
@@ -43,6 +44,7 @@ def test_a_trained_network_is_calibrated_on_the_other_engine(network, armpi):
     assert loaded.temperature_ != 1.0
     assert loaded.encoder.expected.name == "armpi_fpv"
     assert next(iter(loaded.classes_)) == "healthy"
+    assert path.with_suffix(".onnx").stat().st_size > path.stat().st_size / 2
 
 
 def test_a_network_diagnoses_as_bayes_does(failuretwin, network, simulated, tmp_path):

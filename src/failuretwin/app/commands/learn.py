@@ -138,6 +138,7 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str, robot: opt.Robot
 
 @click.command()
 @opt.file_option("--out", "MODEL", "Network to write (.npz).", required=True)
+@opt.file_option("--onnx", "FILE", "Write it as an ONNX file too, for a robot's own computer.")
 @opt.flag_option("--all-arms", "Learn from all bundled arms: one network for any of them.")
 @click.option(
     "--device",
@@ -154,6 +155,7 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str, robot: opt.Robot
 @opt.calibrated_robot_options()
 def train(
     out: Path,
+    onnx: Path | None,
     all_arms: bool,
     device: str,
     iterations: int,
@@ -169,17 +171,24 @@ def train(
     from failuretwin.data_knowledge.store import check_writable
 
     check_learning()
-    from failuretwin.decision.learned.storage import check_network_file, save_network
+    from failuretwin.decision.learned.storage import (
+        check_network_file,
+        export_onnx,
+        save_network,
+    )
     from failuretwin.decision.training import TrainingPlan, train_network
 
     check_network_file(out)
-    check_writable(out)
+    for file in filter(None, (out, onnx)):
+        check_writable(file)
     known = robot.known
     chosen = parse_cli_hypotheses(hypotheses, robot.model)
     plan = TrainingPlan(iterations, robot.seed, hypotheses=chosen, all_arms=all_arms, device=device)
     with progress_bar("training", iterations) as advance:
         diagnoser, alone, both = train_network(plan, known, lambda done: advance(1))
     save_network(diagnoser, out)
+    if onnx is not None:
+        export_onnx(diagnoser, onnx)
     tell(
         f"of {alone.runs} simulated runs of the physics engine {100.0 * alone.accuracy:.1f} % "
         f"right, log score {alone.log_score:.3f} nats a run, "
