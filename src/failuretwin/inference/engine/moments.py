@@ -78,6 +78,10 @@ class Moments:
         """Variance of each motor by its own share of the bend, same axes as `late` [rad2]."""
         return np.asarray((OWN_BEND * self.bend) ** 2)
 
+    def trailing(self, lag_s: FloatArray) -> Moments:
+        """Return the same of motors that trail their commands by more, (motor,) [s]."""
+        return replace(self, base=self.base - self.speed * lag_s)
+
     @property
     def runs(self) -> int:
         """How many runs."""

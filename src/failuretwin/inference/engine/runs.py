@@ -236,12 +236,18 @@ class RunsEvidence:
         return Picks(run, row, np.zeros_like(row))
 
     def _narrow(self, h: int, one: Weighed) -> Picks:
-        """Keep the rows of a hypothesis that come near its best, with the outcomes that count."""
+        """Keep the rows of a hypothesis that come near its best, with the outcomes that count.
+
+        That of a healthy robot in which nothing changes is always kept: robots that scatter more
+        may need no change where the usual one does.
+        """
         table: FloatArray = np.full(self.rows[h].log_prior.shape, -np.inf)
         table[one.picks.run, one.picks.row] = one.log_evidence
         most = min(MOST_ROWS, table.shape[1])
         least = np.maximum(table.max(axis=1) - ROWS_NATS, np.sort(table, axis=1)[:, -most])
         near = (table >= least[:, None]) & np.isfinite(table)
+        if self.hypotheses[h].is_healthy:
+            near[:, 0] = np.isfinite(table[:, 0])
         some = np.flatnonzero(near[one.picks.run, one.picks.row])
         kept, share = one.picks[some], one.found.share[some]
         self.prepared[h] = narrowed(self.scene, self.rows[h], kept, share, self.components)
@@ -263,6 +269,7 @@ class RunsEvidence:
             row[one.picks.run[order], h] = one.picks.row[order]
             says[one.picks.run[order], h] = one.log_evidence[order] + self.log_odds[h]
         healthy = [h for h, one in enumerate(self.hypotheses) if one.is_healthy]
+        row[:, healthy] = 0  # where nothing changes, as in `_narrow`
         others = says.copy()
         others[:, healthy] = -np.inf
         asked = np.zeros(says.shape, dtype=bool)

@@ -80,9 +80,10 @@ class Layout:
         return self.bend.stop
 
     def place(self, theta: FloatArray) -> FloatArray:
-        """Return where theta is expanded: registration and offsets of it, all else at 0."""
-        kept = np.arange(len(theta)) < self.offsets.stop
-        return np.where(kept, theta, 0.0)
+        """Return where theta is expanded: registration, offsets and lags of it, all else at 0."""
+        at = np.arange(len(theta))
+        lags = (at >= self.lags.start) & (at < self.lags.stop)
+        return np.where((at < self.offsets.stop) | lags, theta, 0.0)
 
     def own(self, motor: int) -> list[int]:
         """Return the places of one motor's bias, compliance and friction."""

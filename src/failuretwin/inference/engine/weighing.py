@@ -67,6 +67,7 @@ class Weighing:
         asked: Hypotheses with rows that are weighed, (run, hypothesis); None: all.
         spread: V by which rows are centred, (theta, theta); None: that of the first component.
         known: What the runs say of the hypotheses with rows, where that was found before.
+        lag_s: Lags of the motors about which runs on the way are expanded, (motor,) [s]; None: 0.
     """
 
     likelihood: RunLikelihood
@@ -78,6 +79,7 @@ class Weighing:
     asked: BoolArray | None = None
     spread: FloatArray | None = None
     known: RunsEvidence | None = None
+    lag_s: FloatArray | None = None
 
     def seen_moving(self, moving: TransientSamples) -> Weighing:
         """Return the same runs with readings on the way beside where they rest."""
@@ -106,9 +108,10 @@ class Weighing:
             return self.known
         model = self.likelihood.model
         seen = registered_evidence(self.likelihood.evidence, self.place, model.sensors)
+        moments = moments_of(model, seen)
         scene = Scene.of(
             model.without_doubt,
-            moments_of(model, seen),
+            moments if self.lag_s is None else moments.trailing(self.lag_s),
             self.priors,
             self.layout,
             self.components.usual if self.spread is None else self.spread,
@@ -127,6 +130,9 @@ class Weighing:
     def at_best(self) -> RunLikelihood:
         """The runs as a robot and a sensor would have shown them whose theta is 0."""
         _, theta = self.best
+        if self.lag_s is not None:
+            theta = theta.copy()
+            theta[:, self.layout.lags] += self.lag_s
         likelihood, scene = self.likelihood, self.evidence.scene
         model, way = likelihood.model, likelihood.moving
         offset = np.einsum("rmct,rt->rmc", scene.columns[:, :, 0], theta)

@@ -43,8 +43,11 @@ STANDS_S = 0.12
 CORNER_S = 0.06
 """Speed is the mean over twice that [s]: near a corner of the command a lag tells which it is."""
 BEND_S = 0.05
-"""Time constant with which motors follow, at most [s], assumed: where a command accelerates by a,
-they are off the same command a lag before by a share of half its square times a."""
+"""Time constant with which motors follow, at most [s], assumed: they are off the command a lag
+before by a share of what such a first-order lag makes of it."""
+AGES, FOLLOWED = np.polynomial.laguerre.laggauss(8)
+"""Ages of a command, in the time constant of such a lag, and the weight of each in what it makes of
+the command."""
 LEAST_FRICTION_RAD = 1e-4
 """Friction that counts as none [rad]."""
 CURVED_RAD = 0.01
@@ -180,6 +183,7 @@ class _Looks:
         path = self.model.sensors.expected(pose)[0]
         off = np.median(point[near] - path[:-1], axis=0)
         ends = told(time[at] + CORNER_S * np.array([-1.0, 1.0]))
+        followed = FOLLOWED @ told(time[at] + BEND_S * (1.0 - AGES))
         lasted = (time[at] - lag - begin) / (1.0 - early)
         ramp = np.maximum(self.evidence.settled.movements.ramp_duration[run, m], 1e-3)
         return _Moment(
@@ -190,7 +194,7 @@ class _Looks:
             pose[-1],
             np.minimum(ramp, lasted),
             (ends[1] - ends[0]) / (2.0 * CORNER_S),
-            0.5 * (BEND_S / CORNER_S) ** 2 * (ends[0] - 2.0 * pose[-1] + ends[1]),
+            followed - pose[-1],
             self._friction(run, np.minimum(time[at] - lag, end)),
             np.clip((time[at] - lag - start) / (1.0 - early) / ramp, 0.0, 1.0)
             if not curved

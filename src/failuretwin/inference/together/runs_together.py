@@ -263,6 +263,7 @@ class RunsTogether:
             np.tile(self.here[:REGISTRATION], (len(rows), 1)),
             asked,
             self.belief.moments[1][0] * np.outer(self.unit, self.unit),
+            lag_s=self.here[self.layout.lags] if self.layout.moving else None,
         )
         return Judged(rows, weighing, used, self._loose[some])
 
