@@ -16,15 +16,24 @@ from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Schedule, Variation
 from failuretwin.digital_model.robot import load_robot
+from failuretwin.digital_model.servo import first_order_lag
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.engine.moments import LATE_RATE, moments_of
 from failuretwin.inference.engine.posterior import theta_posterior
 from failuretwin.inference.engine.registration import robot_weighing
+from failuretwin.inference.engine.rows import Scene
+from failuretwin.inference.engine.theta import Layout
+from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.observation.on_the_way import SHARE, likeliest_lag, on_the_way
+from failuretwin.inference.observation.on_the_way import (
+    BEND_S,
+    SHARE,
+    likeliest_lag,
+    on_the_way,
+)
 
 ROBOT = load_robot("armpi_fpv")
 STEP_S = 0.01
@@ -199,6 +208,50 @@ def test_the_bend_of_a_first_order_lag_is_found():
     at = weighing.layout.bend.start
     assert abs(mean[0, at] - 0.5) < 2.0 * np.sqrt(covariance[0, at, at])
     assert mean[0, at] > 0.0
+
+
+def clipped():
+    """A curve that stops dead where the range of a motor ends."""
+    return np.clip(curve(), -0.6, 0.6)
+
+
+@pytest.mark.parametrize("command", [curve(), clipped()], ids=["curve", "end"])
+def test_a_bend_is_what_a_first_order_lag_makes_of_the_command(command):
+    """Against its response step by step, also just behind a corner."""
+    healthy = model()
+    _, seen = moments(exact_run(command, 0.0))
+    fine = 1e-3
+    time = np.arange(0.0, STEP_S * (len(command) - 1), fine)
+    told = np.stack([np.interp(time, STEP_S * np.arange(len(command)), c) for c in command.T])
+    followed = first_order_lag(told, told[:, 0], fine, BEND_S)
+    at = seen.begin[0] - healthy.lag_s
+    wanted = [
+        np.interp(at + BEND_S, time, one) - np.interp(at, time, plain)
+        for one, plain in zip(followed, told, strict=True)
+    ]
+    wanted = np.where(seen.movements.curved[0][:, None], np.transpose(wanted), np.nan)
+    found = seen.movements.bend[0]
+    known = np.isfinite(wanted) & seen.usable[0][:, None]
+    assert known.any()
+    np.testing.assert_allclose(found[known], wanted[known], atol=3e-3)
+
+
+def test_a_robot_that_trails_is_expanded_about_its_lags():
+    """Poses that follow the kinematics exactly, of which columns of theta are the first order."""
+    healthy, seen = moments(exact_run(curve(), 0.0))
+    found, lag_s = moments_of(healthy, seen), np.array([0.0, 0.01, 0.02, 0.03])
+    poses = [one.base[:, :, 0] for one in (found, found.trailing(lag_s))]
+    np.testing.assert_allclose(poses[0] - poses[1], found.speed[:, :, 0] * lag_s, atol=1e-12)
+    layout = Layout(4, geometry=False, moving=True)
+    asked = Priors(), layout, np.eye(layout.size)
+    scenes = [Scene.of(healthy.without_doubt, m, *asked) for m in (found, found.trailing(lag_s))]
+    moved = scenes[0].healthy.residual[:, :, 0] - scenes[1].healthy.residual[:, :, 0]
+    linear = scenes[0].columns[:, :, 0][..., layout.lags] @ lag_s
+    usable = found.usable
+    off = np.linalg.norm((moved - linear)[usable], axis=-1)
+    size = np.linalg.norm(linear[usable], axis=-1)
+    assert np.all(off < 0.05 * size.max())
+    assert np.median(size) > 0.002
 
 
 @pytest.mark.parametrize("late_s", [-0.4, -0.1, 0.0, 0.07, 0.3])
