@@ -100,7 +100,7 @@ def exported(network: MotorwiseDiagnoser, tokens: Tokens, folder: Path) -> float
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(folder / "network.onnx", options)
     one = tokens[slice(0, 1)]
-    given = {"features": one.features, "exists": one.exists.astype(np.float32)}
+    given = {"features": one.features, "exists": one.exists}
     return milliseconds(lambda: session.run(None, given))
 
 
