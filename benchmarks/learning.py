@@ -21,6 +21,7 @@ from failuretwin.decision.learned.networks import (
     shuffled_batches,
     training,
 )
+from failuretwin.decision.learned.paper_study import in_bfloat16
 from failuretwin.decision.learned.storage import export_onnx
 from failuretwin.decision.training_data import (
     CHUNK_RUNS,
@@ -47,7 +48,8 @@ def paper_training(cores: int) -> float:
     classes = rng.integers(0, 9, 3240)
     torch.set_num_threads(cores)
     network = build_network("lstm", Shape(6, 9))
-    steps = training(network, shuffled_batches(features, classes, 32, rng), 1000)
+    batches = shuffled_batches(features, classes, 32, rng)
+    steps = in_bfloat16(training(network, batches, 1000))
     for _ in itertools.islice(steps, 10):
         pass
     begun, timed = time.perf_counter(), 60
@@ -100,7 +102,7 @@ def exported(network: MotorwiseDiagnoser, tokens: Tokens, folder: Path) -> float
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(folder / "network.onnx", options)
     one = tokens[slice(0, 1)]
-    given = {"features": one.features, "exists": one.exists.astype(np.float32)}
+    given = {"features": one.features, "exists": one.exists}
     return milliseconds(lambda: session.run(None, given))
 
 

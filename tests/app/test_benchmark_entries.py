@@ -17,6 +17,7 @@ from failuretwin.app.cli import cli
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.decision.benchmark import real, runner
+from failuretwin.decision.benchmark.simulated import load_set
 
 ENTRIES = """
 import numpy as np
@@ -211,6 +212,29 @@ def test_any_change_of_a_data_file_is_refused(change, named, entries, data, tmp_
     error = run("chance", tmp_path / "changed").exception
     assert isinstance(error, InputError)
     assert f"mistaken.nc: has {named}" in str(error) and "Remove it" in str(error)
+
+
+def test_a_damaged_data_file_is_refused(entries, data, tmp_path):
+    place = "simulated/armpi_fpv/mistaken.nc"
+    run("chance", data, "first")
+    damaged = tmp_path / "damaged" / place
+    damaged.parent.mkdir(parents=True)
+    damaged.write_bytes((data / place).read_bytes()[:-1000])
+    error = run("chance", tmp_path / "damaged").exception
+    assert isinstance(error, InputError)
+    assert "mistaken.nc: cannot be read" in str(error) and "Remove it" in str(error)
+
+
+def test_changes_below_the_resolution_of_the_data_do_not_reach_a_method(entries, data, tmp_path):
+    place = "simulated/armpi_fpv/mistaken.nc"
+    run("chance", data, "first")
+    moved = tmp_path / place
+    moved.parent.mkdir(parents=True)
+    runs = load_run_set(data / place)
+    save_run_set(runs.assign(measured=runs["measured"] + 1e-6), moved)
+    assert load_set("armpi_fpv", "mistaken", tmp_path).identical(
+        load_set("armpi_fpv", "mistaken", data)
+    )
 
 
 def test_simulated_sets_have_no_copy(tmp_path):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from functools import partial
 
 import click
@@ -32,6 +33,13 @@ def network(tmp_path_factory):
         onnx = path.with_suffix(".onnx")
         answer = run("train", "--out", path, "--onnx", onnx, "--iterations", 4, "--seed", 3)
     return path, answer.output
+
+
+def test_a_missing_onnx_library_is_told_before_the_training(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "onnxscript", None)
+    with pytest.raises(FailureTwinError, match=r"failuretwin\[learn\]"):
+        run("train", "--out", tmp_path / "n.npz", "--onnx", tmp_path / "n.onnx")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_trained_network_is_calibrated_on_the_other_engine(network, armpi):

@@ -196,6 +196,10 @@ def test_a_stored_network_takes_other_robots_and_calibrations(trained, armpi, tm
     save_network(trained, tmp_path / "network.npz")
     ur5e = load_network(tmp_path / "network.npz", load_robot("ur5e"))
     assert len(ur5e.classes_) == 1 + 2 * len(ur5e.known_robot.motors)
+    named = load_network(tmp_path / "network.npz", "ur5e")
+    assert list(named.classes_) == list(ur5e.classes_)
+    with pytest.raises(InputError, match="ur5"):
+        load_network(tmp_path / "network.npz", "ur55")
     ideal = load_network(tmp_path / "network.npz", CalibratedRobot(armpi, NO_IMPERFECTIONS))
     assert "healthy behaviour: none" in ideal.about[1]
 
@@ -214,7 +218,7 @@ def test_onnx_runtime_agrees_for_any_arm(trained, runs, encoder, tmp_path):
         (trained.for_robot(panda), others),
         (trained, encoder.encode(runs)[slice(0, 1)].padded(7)),
     ):
-        given = {"features": tokens.features, "exists": tokens.exists.astype(np.float32)}
+        given = {"features": tokens.features, "exists": tokens.exists}
         chances, *_ = session.run(None, given)
         np.testing.assert_allclose(chances, network.predict_proba(tokens), atol=5e-6)
     assert session.get_modelmeta().custom_metadata_map["modes"] == "stuck,steady_state_error"

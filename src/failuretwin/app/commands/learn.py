@@ -148,8 +148,8 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str, robot: opt.Robot
 )
 @opt.count_option("--iterations", 6000, "Number of batches, of 64 runs each.", least=1)
 @opt.hypotheses_option(
-    "Hypotheses that the network distinguishes, such as healthy,motor_2:stuck. Default: the "
-    "paper's nine classes."
+    "Hypotheses that the network distinguishes: healthy, and each of some modes at each motor. "
+    "Default: the paper's nine classes."
 )
 @opt.plugin_option
 @opt.calibrated_robot_options()
@@ -173,12 +173,15 @@ def train(
     check_learning()
     from failuretwin.decision.learned.storage import (
         check_network_file,
+        check_onnx,
         export_onnx,
         save_network,
     )
     from failuretwin.decision.training import TrainingPlan, train_network
 
     check_network_file(out)
+    if onnx is not None:
+        check_onnx()
     for file in filter(None, (out, onnx)):
         check_writable(file)
     known = robot.known

@@ -236,7 +236,10 @@ def load_set(arm: str, name: str, data: Path) -> xr.Dataset:
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         save_run_set(make_set(arm, name), path)
-    runs = load_run_set(path)
+    try:
+        runs = _in_counts(load_run_set(path))
+    except InputError as error:
+        raise InputError(f"{error} Remove it and run the command again.") from error
     _check_same(
         path, "variables", sorted(map(str, runs.variables)), sorted([*VARIABLES, *COORDINATES])
     )

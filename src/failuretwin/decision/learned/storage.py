@@ -6,8 +6,11 @@ Our own format is an npz archive of plain arrays and a JSON configuration, read 
 from __future__ import annotations
 
 import json
+import logging
 import platform
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -28,9 +31,10 @@ from failuretwin.decision.learned.log_pool import PoolWeights
 from failuretwin.decision.learned.moment_encoder import MomentEncoder
 from failuretwin.decision.learned.moment_features import FEATURES
 from failuretwin.decision.learned.motorwise import MotorwiseNetwork, class_logits
-from failuretwin.digital_model.calibrated_robot import CalibratedRobot, calibrated
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot, load_robot
+from failuretwin.digital_model.twin import DigitalTwin
 
 FORMAT = 2
 SUFFIX = ".npz"
@@ -88,9 +92,7 @@ def arm_fingerprint(robot: Robot) -> str:
     return fingerprint([robot.chain, robot.loads, robot.sense, robot.sensor_sense])
 
 
-def load_network(
-    path: str | Path, robot: Robot | CalibratedRobot | None = None
-) -> MotorwiseDiagnoser:
+def load_network(path: str | Path, robot: RobotLike | None = None) -> MotorwiseDiagnoser:
     """Read a trained network.
 
     It diagnoses any robot. It knows the one it was trained for by the calibration in the file,
@@ -101,9 +103,11 @@ def load_network(
         robot: The robot, calibrated or not; None: the bundled one named in the file.
 
     Raises:
-        InputError: If the file is not a network, or one of another version.
+        InputError: If the robot is unknown, or the file no network or one of another version.
     """
     path = Path(path)
+    if isinstance(robot, str | Path):
+        robot = load_robot(robot)
     with reading(path, "a network", "Expected a file that `failuretwin train` wrote."):
         check_npz(path)
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
@@ -114,7 +118,7 @@ def load_network(
 def _restored(
     configuration: dict[str, Any],
     arrays: Arrays,
-    robot: Robot | CalibratedRobot | None,
+    robot: RobotLike | None,
     path: Path,
 ) -> MotorwiseDiagnoser:
     if configuration["format"] != FORMAT:
@@ -154,12 +158,13 @@ def _widths(table: dict[str, Any]) -> dict[str, Widths]:
 
 
 def _known_robot(
-    configuration: dict[str, Any], robot: Robot | CalibratedRobot | None, path: Path
+    configuration: dict[str, Any], robot: RobotLike | None, path: Path
 ) -> CalibratedRobot:
     """Return the robot that a network is to diagnose."""
     if isinstance(robot, CalibratedRobot):
         return robot
-    model = load_robot(configuration["robot"]) if robot is None else robot
+    given = robot.robot if isinstance(robot, DigitalTwin) else robot
+    model = load_robot(configuration["robot"] if given is None else given)
     same = configuration["robot"] == model.name
     if not same or configuration["arm_sha256"] != arm_fingerprint(model):
         return calibrated(model)
@@ -191,12 +196,34 @@ class _Motorwise(nn.Module):
 
     def forward(self, features: Tensor, exists: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return probabilities (run, class), and rows, bins and sizes."""
-        healthy, rows, bins, sizes = self.network(features, exists)
+        healthy, rows, bins, sizes = self.network(features, exists.to(features.dtype))
         scores = class_logits(healthy, rows)
         return torch.softmax(scores / self.temperature, dim=1), rows, bins, sizes
 
 
 RUN, MOMENT, MOTOR = (torch.export.Dim(name, max=4096) for name in ("run", "moment", "motor"))
+
+
+def check_onnx() -> None:
+    """Raise InputError if the library that writes ONNX files is missing."""
+    with needs_extra("ONNX files need onnxscript", "learn"):
+        import onnxscript  # noqa: F401
+
+
+EXPORTER_LOG = "torch.onnx._internal.exporter._registration"
+"""Logger of the exporter that warns of each operator of torchvision, which no network uses."""
+
+
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Keep the warnings of a logger from the terminal."""
+    logger = logging.getLogger(name)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def export_onnx(diagnoser: MotorwiseDiagnoser, path: Path) -> None:
@@ -206,13 +233,12 @@ def export_onnx(diagnoser: MotorwiseDiagnoser, path: Path) -> None:
     (run, class), and `rows`, `bins` and `sizes` for onset and size. The metadata entries `classes`
     and `modes` list the classes of the robot and the modes.
     """
-    with needs_extra("ONNX files need onnxscript", "learn"):
-        import onnxscript  # noqa: F401
-    with warnings.catch_warnings():
+    check_onnx()
+    with warnings.catch_warnings(), _quiet(EXPORTER_LOG):
         warnings.simplefilter("ignore")  # from inside the exporter
         program = torch.onnx.export(
             _Motorwise(diagnoser).eval(),
-            (torch.zeros(2, 3, 4, FEATURES), torch.ones(2, 3)),
+            (torch.zeros(2, 3, 4, FEATURES), torch.ones(2, 3, dtype=torch.bool)),
             input_names=["features", "exists"],
             output_names=["probabilities", "rows", "bins", "sizes"],
             opset_version=OPSET,
