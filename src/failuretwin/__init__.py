@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from failuretwin.decision.evaluation import compare, evaluate
     from failuretwin.decision.expected_cost import advise
     from failuretwin.decision.learned.log_pool import HybridDiagnoser
-    from failuretwin.decision.learned.storage import load_network
+    from failuretwin.decision.learned.storage import load_network, save_network
     from failuretwin.decision.remaining_life import remaining_life
     from failuretwin.decision.results import read_results
     from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
@@ -119,6 +119,7 @@ _HOME = {
     "run_set": "core.runs",
     "sample_log": "data_knowledge.readers.read",
     "save_calibration": "connection.calibration.result",
+    "save_network": "decision.learned.storage",
     "simulate": "data_knowledge.generate",
     "train": "decision.training",
 }
@@ -184,16 +185,20 @@ __all__ = [
     "run_set",
     "sample_log",
     "save_calibration",
+    "save_network",
     "simulate",
     "train",
 ]
 
 
+_STORE = ("the store needs SQLAlchemy and alembic", "store")
+_NETWORKS = ("networks need PyTorch and scikit-learn", "learn")
 _EXTRAS = {
-    "Store": ("the store needs SQLAlchemy and alembic", "store"),
-    "load_network": ("networks need PyTorch and scikit-learn", "learn"),
-    "open_store": ("the store needs SQLAlchemy and alembic", "store"),
-    "train": ("networks need PyTorch and scikit-learn", "learn"),
+    "Store": _STORE,
+    "load_network": _NETWORKS,
+    "open_store": _STORE,
+    "save_network": _NETWORKS,
+    "train": _NETWORKS,
 }
 """Names that need an extra as soon as they are used: the libraries, and the extra."""
 

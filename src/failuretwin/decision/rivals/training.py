@@ -145,14 +145,14 @@ class _Trainer:
         return self._kept(network, batches)
 
     def _kept(self, network: Any, batches: Iterator[Batch]) -> Any:
-        """Train a network once: load it if it is stored."""
+        """Train a network, or load that of another method that goes on from it."""
         import torch
 
         from failuretwin.decision.learned.networks import training
 
         kind = self.job.method if self.job.method in NETWORKS else "cnn"
         stored = self.folder / f"{replace(self.job, method=kind).name}.pt"
-        if stored.is_file():
+        if kind != self.job.method and stored.is_file():
             network.load_state_dict(torch.load(stored, weights_only=True))
             return network
         run = training(network, batches, self.plan.iterations, RATE, decay=True)
