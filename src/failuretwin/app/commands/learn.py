@@ -188,7 +188,13 @@ def train(
     chosen = parse_cli_hypotheses(hypotheses, robot.model)
     plan = TrainingPlan(iterations, robot.seed, hypotheses=chosen, all_arms=all_arms, device=device)
     with progress_bar("training", iterations) as advance:
-        diagnoser, alone, both = train_network(plan, known, lambda done: advance(1))
+
+        def report(done: int) -> None:
+            advance(1)
+            if done == iterations:
+                tell("calibrating on runs of the physics engine, about a minute")
+
+        diagnoser, alone, both = train_network(plan, known, report)
     save_network(diagnoser, out)
     if onnx is not None:
         export_onnx(diagnoser, onnx)
