@@ -120,8 +120,8 @@ class Stretches(Movements):
     Attributes:
         beginning: Reference at the start of each, (run, movement, motor) [rad].
         speed: Of the reference at the reading, (run, movement, motor) [rad/s]; 0 at rest.
-        bend: Half its acceleration there times the square of a usual lag, (run, movement, motor)
-            [rad].
+        bend: By what a first-order lag of the reference differs there from the reference that much
+            later, (run, movement, motor) [rad].
         direction: Of the friction there, from -1 to 1, (run, movement, motor); NaN: as it last
             travelled.
         done: Share of the movement that each motor had made, (run, movement, motor).

@@ -1,12 +1,12 @@
 """Theta: what all moments of a robot share and nobody knows exactly.
 
     f = G theta
-    G = [ I | -[x]x | x | J | J diag(g) | -J diag(d) | dx/dgeometry | -J diag(qd) | J b ]
+    G = [ I | -[x]x | x | J | J diag(g) | -J diag(d) | dx/dgeometry | -J diag(qd) | J o ]
 
 with origin t [m], turn w [rad] and scale k [-] of the tool sensor's frame, bias b [rad], compliance
 c [rad/(N m)] and friction f [rad] of each motor, the frames of the joints, each moved [m] and
 turned [rad], and, of robots that are seen on the way, the lag of each motor [s] beside the mean one
-of the robot, and by which share of b = T^2 qdd / 2 their motors are off an accelerated command,
+of the robot, and by which share of the bend o of a command (`on_the_way`) its motors are off,
 beside the mean one. The prior is a mixture of normal distributions.
 
 Section: docs/inference.md#theta
@@ -224,7 +224,7 @@ class Motion:
     Attributes:
         direction: Sign of the last travel.
         speed: [rad/s].
-        bend: Half the acceleration times the square of a usual lag [rad].
+        bend: What a usual first-order lag makes of the command beside a delay [rad].
     """
 
     direction: FloatArray

@@ -3,9 +3,11 @@
 A stretch is the part of a movement up to one reading. The tool is expected where the command was a
 lag before; whoever starts early or late, or follows with another lag, is off along the motion:
 
-    e_k = y(q(t_k - lag)) - J qd (lag of each motor) + J qdd (sum of squared time constants) / 2
+    e_k = y(q(t_k - lag)) - J qd (lag of each motor) + J o (share of the bend)
+    o = q_T(t_k - lag + T) - q(t_k - lag)
 
-with variance along the motion (qd sigma)^2: motors follow as a chain of first-order lags does.
+with variance along the motion (qd sigma)^2 and q_T the command as a first-order lag of time
+constant T follows it: T^2 qdd / 2 of a smooth command, behind a corner what is left to go.
 
 A rest is a stretch with qd = 0. Readings near each other share one lag and one scatter: they are
 pooled.
