@@ -227,11 +227,11 @@ def test_a_full_disk_is_one_line(failuretwin, store, tmp_path):
 def test_the_store_of_the_environment_is_used(run, store, monkeypatch):
     monkeypatch.setenv("FAILURETWIN_STORE", "robots.db")
     assert "remembered in robots.db: 3 runs of armpi_fpv" in run("diagnose", SAMPLE, *AT, *FEW)
-    assert run("history", "armpi_fpv").startswith("armpi_fpv: motor 3 stuck, raised")
+    assert "motor 3 stuck" in run("history", "armpi_fpv")
 
 
 def test_a_store_on_a_server_works_alike(run, postgres):
     url = postgres.place().url
     run("store", "init", "--store", url)
     run("diagnose", SAMPLE, *AT, "--store", url, *FEW)
-    assert run("history", "armpi_fpv", "--store", url).startswith("armpi_fpv: motor 3 stuck")
+    assert "motor 3 stuck" in run("history", "armpi_fpv", "--store", url)
