@@ -28,7 +28,7 @@ from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.inference.diagnoser import BayesDiagnoser
 
 DAY_S = 86_400
-LOW_PRIORITY = 10
+LOW_PRIORITY = 5
 CHILD = """import os, threading
 def end_with_parent():
     os.read(0, 1)
