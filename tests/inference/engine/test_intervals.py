@@ -54,6 +54,14 @@ def test_onsets_of_an_arm_of_a_class_lie_in_their_intervals(stuck):
     assert share_inside(*stuck, "onset_90", "onset") > 0.75
 
 
+def test_a_motor_that_was_stuck_before_the_run_is_held_where_its_own_zero_puts_it():
+    """What is known of an arm of a class is not where it settles, but where such arms do."""
+    known = calibrated(load_robot("panda"))
+    found, runs = judged(known.imperfections, known.robot, "stuck", 12, onset_s=(0.0, 0.0))
+    assert share_inside(found, runs, "magnitude_90", "magnitude") > 0.8
+    assert share_inside(found, runs, "onset_90", "onset") > 0.8
+
+
 def test_sizes_of_errors_of_an_arm_of_a_class_lie_in_their_intervals(so101):
     found, runs = judged(*so101, "steady_state_error", 12)
     assert share_inside(found, runs, "magnitude_90", "magnitude") > 0.65

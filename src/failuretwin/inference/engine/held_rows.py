@@ -1,6 +1,9 @@
 """A motor that is held from some time on: one angle for all moments after it.
 
-Each onset is a row: on the plateau, where the motor had settled, or on the ramp, anywhere.
+Each onset is a row: on the plateau, where the motor had settled, or on the ramp, anywhere. Where it
+had settled is as unknown as its own part of theta:
+
+    x = was + b + c g - f d + z
 
 Section: docs/inference.md#hypotheses
 """
@@ -14,6 +17,7 @@ from failuretwin.core.numerics import log_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.inference.engine.moved_motor import FREE_RAD, Angle, MovedMotor
 from failuretwin.inference.engine.rows import Onsets, Rows, Scene, sampled
+from failuretwin.inference.engine.theta import loads
 from failuretwin.inference.faults.priors import OnsetIntervals, plateau_or_ramp
 
 GRID = 61
@@ -78,8 +82,25 @@ def held_rows(scene: Scene, motor: int) -> Rows:
     if known is not None:
         onsets = sampled(np.full((*centre.shape, 1), known), np.ones((*centre.shape, 1)))
     return moving.rows(
-        centre, variance, _flat(log_prior[..., 0], log_prior[..., 1]), amount_prior, onsets
+        centre,
+        variance,
+        _flat(log_prior[..., 0], log_prior[..., 1]),
+        amount_prior,
+        onsets,
+        _tie(scene, motor),
     )
+
+
+def _tie(scene: Scene, motor: int) -> FloatArray:
+    """Return what theta adds to where the motor had settled, (run, row, theta); 0 on ramps."""
+    moments, layout = scene.moments, scene.layout
+    load = loads(scene.model, scene.settled)[..., motor]
+    direction = moments.direction[:, :, 0, motor]
+    columns = np.stack([np.ones_like(load), load, -direction], axis=-1)
+    tie = np.zeros((moments.runs, 2 * moments.count, layout.size))
+    plateaus = tie[:, ::2]
+    plateaus[..., layout.own(motor)] = np.concatenate([columns[:, :1], columns[:, :-1]], axis=1)
+    return tie
 
 
 def _flat(plateau: FloatArray, ramp: FloatArray) -> FloatArray:
@@ -120,6 +141,8 @@ def _stuck_onsets(
 ) -> Onsets:
     """Return the onset of each row: anywhere on a plateau, on a ramp when it passed the angle.
 
+    A motor that was stuck before the run got stuck at 0.
+
     On a ramp of length T from `was` to `goal`, held at x give or take d, with lag give or take l,
 
         t = begin + T (x - was) / (goal - was),    var(t) = T^2 (d^2 + s^2) / (goal - was)^2 + l^2
@@ -134,6 +157,8 @@ def _stuck_onsets(
     def of_row(run: int, row: int, amount: FloatArray) -> tuple[FloatArray, FloatArray]:
         m, on_ramp = divmod(row, 2)
         parts = begin[run, m, :, None] + POINTS * length[run, m, :, None]  # (part, sample)
+        if row == 0:
+            return np.append(parts[0], 0.0), np.append(share, 1.0)
         if not on_ramp:
             return parts[0], share
         first, travel = was[run, m], goal[run, m] - was[run, m]

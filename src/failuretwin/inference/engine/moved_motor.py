@@ -3,7 +3,8 @@
     angle of the motor in moment m = phi_m(x),    x = centre + z,    H_m = J_k dphi_m/dx
 
 The centre of each row is where the moments from its onset on point: the best of a grid, then two
-Gauss-Newton steps. A motor that is held says nothing of its own part of theta.
+Gauss-Newton steps. A motor that is held says nothing of its own part of theta, unless it is held
+where it had settled, off its target by that part.
 
 Section: docs/inference.md#hypotheses
 """
@@ -174,6 +175,7 @@ class MovedMotor:
         log_prior: FloatArray,
         amount_prior: AmountPrior,
         onsets: Onsets,
+        tie: FloatArray | None = None,
     ) -> Rows:
         """Return the rows about some amounts.
 
@@ -183,6 +185,7 @@ class MovedMotor:
             log_prior: (run, row).
             amount_prior: Log density of the amount.
             onsets: Onset of a run and row.
+            tie: What theta adds to the angle of a motor that is held, (run, row, theta).
         """
         scene, moments, motor = self.scene, self.scene.moments, self.motor
         base = np.repeat(moments.base[:, None], x.shape[1], axis=1)
@@ -204,7 +207,10 @@ class MovedMotor:
         outcomes = Outcomes.of_poses(moments, (value, jacobian), self.variance, *beside)
         G = columns(scene.model, pose, shown, Motion(direction, speed, bend), scene.layout)
         if self.held:
-            G[..., scene.layout.own(motor)] = 0.0
+            own = scene.layout.own(motor)
+            G[..., own] = 0.0
+            if tie is not None:
+                G[..., own] = shown[1][..., motor, None] * tie[:, :, None, None, None, own]
         weight = np.broadcast_to(moments.log_weight[:, None], pose.shape[:-1])
         rows = Rows(
             log_prior,
@@ -218,6 +224,7 @@ class MovedMotor:
             variance,
             amount_prior,
             onsets=onsets,
+            tie=tie,
         )
         return before_onset(rows, scene.healthy, scene.columns)
 

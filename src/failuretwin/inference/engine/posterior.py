@@ -101,12 +101,12 @@ def _onset(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) ->
 
 
 def _size(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> Weighted | None:
-    rows, one = evidence.rows[h], evidence.weighed[h]
+    rows = evidence.rows[h]
     if rows.drawn is not None:
         some, share = some[share > LEAST_SHARE], share[share > LEAST_SHARE]
         mean, deviation = _mean_squares(evidence, h, some)
     elif rows.amount_prior is not None:
-        mean, deviation = one.amount[some].T
+        mean, deviation = _amounts(evidence, h, some).T
         if _is_held(evidence.hypotheses[h]):
             deviation = np.hypot(deviation, evidence.scene.model.count_rounding)
     else:
@@ -116,6 +116,33 @@ def _size(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> 
     if rows.drawn is not None:  # the mean square is nearly normal, not its root
         values = np.sqrt(np.maximum(values, 0.0))
     return Weighted(values.ravel(), weights.ravel())
+
+
+def _amounts(evidence: RunsEvidence, h: int, some: IntArray) -> FloatArray:
+    """Return mean and deviation of the amount of some picks, with what theta adds, (pick, 2)."""
+    rows, one = evidence.rows[h], evidence.weighed[h]
+    told = one.amount[some]
+    if rows.tie is None:
+        return told
+    picks = one.picks[some]
+    tie = rows.tie[picks.run, picks.row]
+    tied = np.flatnonzero(tie.any(axis=-1))
+    if not len(tied):
+        return told
+    some, picks, tie = some[tied], picks[tied], tie[tied]
+    part, variance = evidence.part(h, picks), rows.variance[picks.run, picks.row]
+    V, mu = part.components.theta(picks.run, part.normal)
+    pull = np.einsum("pt,ptu->pu", tie, V)
+    lever = rows.lever[picks.run, picks.row]
+    across = np.einsum("pmct,pt->pmc", part.columns, pull) + variance[:, None, None] * lever
+    across = across.reshape(len(tied), 1, -1)
+    more, less = _given(part, *one.found.some(some).sites, across)
+    prior = variance + np.sum(pull * tie, axis=-1)
+    left = np.maximum(prior - less[:, 0, 0], 0.0)
+    mean = rows.centre[picks.run, picks.row] + np.sum(tie * mu, axis=-1) + more[:, 0]
+    found = told.copy()
+    found[tied] = np.stack([mean, np.sqrt(left)], axis=-1)
+    return found
 
 
 def _is_held(hypothesis: Hypothesis) -> bool:
@@ -384,6 +411,27 @@ def theta_given(
         information: W of each moment, (pick, moment, channel, channel).
         shift: b of each moment, (pick, moment, channel).
     """
+    V, mu = part.components.theta(part.picks.run, part.normal)
+    picks, moments, channels = shift.shape
+    GV = part.columns.reshape(picks, moments * channels, V.shape[-1]) @ V
+    more, less = _given(part, information, shift, np.swapaxes(GV, -1, -2))
+    return mu + more, V - less
+
+
+def _given(
+    part: Part, information: FloatArray, shift: FloatArray, across: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return by how much moments move the mean of something, and lessen its covariance.
+
+    Args:
+        part: The picks.
+        information: W of each moment, (pick, moment, channel, channel).
+        shift: b of each moment, (pick, moment, channel).
+        across: Covariance with f beforehand, (pick, thing, moment * channel).
+
+    Returns:
+        (pick, thing) and (pick, thing, thing).
+    """
     mean, K = part.prior
     picks, moments, channels = shift.shape
     size = moments * channels
@@ -394,7 +442,5 @@ def theta_given(
     system = np.eye(size) + W @ K
     pull = shift.reshape(picks, size) - np.matmul(W, mean[..., None])[..., 0]
     alpha = np.linalg.solve(system, pull[..., None])
-    V, mu = part.components.theta(part.picks.run, part.normal)
-    GV = part.columns.reshape(picks, size, V.shape[-1]) @ V
-    turned = np.swapaxes(GV, -1, -2)
-    return mu + np.matmul(turned, alpha)[..., 0], V - turned @ np.linalg.solve(system, W @ GV)
+    seen = np.linalg.solve(system, W @ np.swapaxes(across, -1, -2))
+    return np.matmul(across, alpha)[..., 0], across @ seen

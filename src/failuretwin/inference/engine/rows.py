@@ -62,6 +62,8 @@ class Rows:
         amount_prior: Log density of the amount; None: the normal one stands.
         drawn: Sizes of outcomes where every movement draws its own; None: it does not.
         onsets: Onset of a run and row; None: no fault.
+        tie: What theta adds to the amount, so that the amount itself is less in doubt,
+            (run, row, theta); None: nothing.
     """
 
     log_prior: FloatArray
@@ -76,6 +78,7 @@ class Rows:
     amount_prior: AmountPrior | None = None
     drawn: Drawn | None = None
     onsets: Onsets | None = None
+    tie: FloatArray | None = None
 
 
 @dataclass(frozen=True)
