@@ -23,7 +23,7 @@ TRACKED, SICK, LIVE = "hall_2-arm_9", "hall_2-arm_7", "hall_1-arm_2"
 THEN = "//label[span[text()='Then']]//option"
 ROBOTS = 9 if PICTURES else 1
 """Robots whose year is simulated: a full wall for the pictures."""
-OPTIONS = ("--demo", "--demo-robots", str(ROBOTS), "--speed", "4")
+OPTIONS = ("--demo", "--demo-robots", str(ROBOTS), "--speed", "1.5")
 
 
 @pytest.fixture(scope="module")
