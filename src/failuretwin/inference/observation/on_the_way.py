@@ -91,8 +91,10 @@ def hardly_rest(evidence: Evidence, model: HealthyModel) -> BoolArray:
     settled = evidence.settled
     rests, movements = settled.usable.sum(axis=1), settled.movements.exists.sum(axis=1)
     most = 0 if model.knows_timing else MOST_RESTS
-    sound = np.array([not quality.fatal for quality in evidence.quality], dtype=bool)
-    return np.asarray((rests <= most) & (2 * rests < movements) & sound)
+    few = np.asarray((rests <= most) & (2 * rests < movements))
+    if few.any():
+        few &= [not quality.fatal for quality in evidence.quality]
+    return few
 
 
 def likeliest_lag(evidence: Evidence, model: HealthyModel) -> float:
