@@ -296,7 +296,7 @@ def mixed(
     if set_ups.fits:
         return likeliest
     everywhere = bool(set_ups.best.set_up.what)
-    lost = [everywhere or _unexplained(likeliest, run, known[run]) for run in range(count)]
+    lost = [_unexplained(likeliest, run, known[run], everywhere) for run in range(count)]
     return replace(likeliest, no_verdict=[ANOTHER if one else "" for one in lost])
 
 
@@ -308,13 +308,13 @@ def common_remarks(set_ups: SetUpPosterior, rounding: Sequence[str]) -> list[str
     return [line for line in (remark, *rounding) if line]
 
 
-def _unexplained(posterior: Posterior, run: int, set_up: str) -> bool:
+def _unexplained(posterior: Posterior, run: int, set_up: str, wrong: bool) -> bool:
     """Return whether neither a hypothesis nor a sensor that stands a little elsewhere explains it.
 
-    The hypothesis that the fault is unknown says so itself.
+    The hypothesis that the fault is unknown says so itself, also where the set-up is `wrong`.
     """
     best = posterior.hypotheses[int(np.argmax(posterior.log_posterior[run]))]
-    return best.known and not set_up and run_misfit(posterior, run) > FITS
+    return best.known and (wrong or (not set_up and run_misfit(posterior, run) > FITS))
 
 
 def set_up_remark(set_ups: SetUpPosterior) -> str:
