@@ -107,6 +107,35 @@ def test_stretches_of_ramps_are_those_of_the_command():
     )
 
 
+def test_a_curve_is_read_on_its_way_also_where_the_tool_rests_behind_it():
+    """Its last stretch, up to the rest, begins where the one before was read."""
+    command = np.concatenate([curve(), np.repeat(curve()[-1:], 200, axis=0)])
+    _, seen = moments(exact_run(command, 0.0))
+    stretches, time = seen.movements, STEP_S * np.arange(len(command))
+    assert isinstance(stretches, Stretches)
+    assert stretches.at_rest[0].tolist() == [False] * (len(stretches.at_rest[0]) - 1) + [True]
+    assert len(stretches.at_rest[0]) > 6
+    np.testing.assert_allclose(stretches.beginning[0, 1:], stretches.target[0, :-1], atol=1e-6)
+    wanted = np.stack([np.interp(stretches.start[0], time, one) for one in command.T], axis=-1)
+    np.testing.assert_allclose(stretches.beginning[0], wanted, atol=1e-6)
+    np.testing.assert_allclose(stretches.target[0, -1], command[-1], atol=1e-6)
+
+
+def test_a_motor_that_stops_on_a_curve_is_found_where_the_tool_rests_behind_it():
+    command = np.concatenate([curve(), np.repeat(curve()[-1:], 200, axis=0)])
+    stuck = command.copy()
+    stuck[350:, 1] = stuck[350, 1]
+    runs = exact_run(command, 0.0)
+    seen = np.full((len(command), 3), np.nan)
+    seen[::10] = DigitalTwin(ROBOT).path(stuck[::10])
+    (found,) = ft.diagnose(
+        runs.assign(measured=(runs["measured"].dims, seen[None])), ROBOT, "generic"
+    )
+    assert str(found.diagnosis) == "motor_2:stuck"
+    assert found.magnitude == pytest.approx(stuck[350, 1], abs=0.03)
+    assert found.onset_90[0] <= 3.5 <= found.onset_90[1]
+
+
 def test_points_of_an_arm_without_lag_are_those_of_the_command():
     healthy = model()
     for command in (zigzag(), curve()):

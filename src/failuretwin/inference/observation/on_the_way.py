@@ -10,7 +10,7 @@ with variance along the motion (qd sigma)^2 and q_T the command as a first-order
 constant T follows it: T^2 qdd / 2 of a smooth command, behind a corner what is left to go.
 
 A rest is a stretch with qd = 0. Readings near each other share one lag and one scatter: they are
-pooled.
+pooled. A long curve is read on its way also where the tool rests behind it.
 
 Section: docs/inference.md#moments
 """
@@ -50,6 +50,10 @@ before by a share of what such a first-order lag makes of it."""
 AGES, FOLLOWED = np.polynomial.laguerre.laggauss(8)
 """Ages of a command, in the time constant of such a lag, and the weight of each in what it makes of
 the command."""
+LEAST_RAMP_S = 1e-3
+"""Shortest ramp that is divided by [s]."""
+LONG_S = 2.0 * APART_S
+"""A curve that lasts longer is read on its way, whether the tool rests behind it or not [s]."""
 LEAST_FRICTION_RAD = 1e-4
 """Friction that counts as none [rad]."""
 CURVED_RAD = 0.01
@@ -85,16 +89,29 @@ class _Moment:
 def hardly_rest(evidence: Evidence, model: HealthyModel) -> BoolArray:
     """Return which runs are judged by readings on the way, (run,).
 
-    Those with `MOST_RESTS` at most, or with none of a robot whose timing is calibrated: where
-    motors settle is known better than how they get there.
+    Those with long curves, and those with `MOST_RESTS` at most, or with none of a robot whose
+    timing is calibrated: where motors settle is known better than how they get there.
     """
-    settled = evidence.settled
-    rests, movements = settled.usable.sum(axis=1), settled.movements.exists.sum(axis=1)
-    most = 0 if model.knows_timing else MOST_RESTS
-    few = np.asarray((rests <= most) & (2 * rests < movements))
+    few = _few_rests(evidence, model) | long_curves(evidence).any(axis=1)
     if few.any():
         few &= [not quality.fatal for quality in evidence.quality]
     return few
+
+
+def _few_rests(evidence: Evidence, model: HealthyModel) -> BoolArray:
+    settled = evidence.settled
+    rests, movements = settled.usable.sum(axis=1), settled.movements.exists.sum(axis=1)
+    most = 0 if model.knows_timing else MOST_RESTS
+    return np.asarray((rests <= most) & (2 * rests < movements))
+
+
+def long_curves(evidence: Evidence) -> BoolArray:
+    """Return which movements are curves of more than `LONG_S`, (run, movement)."""
+    movements = evidence.settled.movements
+    found = np.nan_to_num(movements.ramp_duration).max(axis=-1, initial=0.0) > LONG_S
+    for run, m in np.argwhere(found).tolist():
+        found[run, m] = _is_curved(evidence, run, m)
+    return found
 
 
 def likeliest_lag(evidence: Evidence, model: HealthyModel) -> float:
@@ -116,14 +133,15 @@ def on_the_way(evidence: Evidence, model: HealthyModel, lag_s: float) -> Settled
     settled = evidence.settled
     hardly = hardly_rest(evidence, model)
     hardly &= ~strays_between(evidence, model, hardly, lag_s)
-    unseen = settled.movements.exists & ~settled.usable & hardly[:, None]
+    unseen = settled.movements.exists & ~settled.usable & _few_rests(evidence, model)[:, None]
+    unseen = (unseen | long_curves(evidence)) & hardly[:, None]
     if not model.sensors.tool_alone or not unseen.any():
         return settled
     looks = _Looks(evidence, model, lag_s)
     found = {(run, m): looks.moments(run, m) for run, m in np.argwhere(unseen).tolist()}
     if not any(found.values()):
         return settled
-    return _joined(settled, found)
+    return _joined(settled, found, lag_s)
 
 
 @dataclass(frozen=True)
@@ -149,7 +167,7 @@ class _Looks:
         seen = np.flatnonzero(read & (time > start + lag) & (time < end - 1e-9))
         if not len(seen):
             return []
-        curved = self._is_curved(run, m)
+        curved = _is_curved(self.evidence, run, m)
         early = 0.0 if curved else self.model.shortening
         longest = movements.ramp_duration[run, m].max() * (1.0 - early)
         stood = time[seen[-1]] - start - lag
@@ -189,7 +207,7 @@ class _Looks:
         ends = told(time[at] + CORNER_S * np.array([-1.0, 1.0]))
         followed = FOLLOWED @ told(time[at] + BEND_S * (1.0 - AGES))
         lasted = (time[at] - lag - begin) / (1.0 - early)
-        ramp = np.maximum(self.evidence.settled.movements.ramp_duration[run, m], 1e-3)
+        ramp = np.maximum(self.evidence.settled.movements.ramp_duration[run, m], LEAST_RAMP_S)
         return _Moment(
             begin,
             time[at],
@@ -233,31 +251,37 @@ class _Looks:
         count = min(place, len(near) - 1 - place)
         return near[place - count : place + count + 1]
 
-    def _is_curved(self, run: int, m: int) -> bool:
-        """Return whether the command of a movement strays from straight ramps."""
-        settled = self.evidence.settled
-        time = as_floats(self.evidence.runs["time"].values)
-        start, end = settled.movements.start[run, m], settled.end[run, m]
-        when = time[(time >= start) & (time <= end)]
-        straight = settled.movements[run : run + 1].reference(when)[0]
-        return bool(
-            np.abs(command_at(self.evidence, run, when) - straight).max(initial=0.0) > CURVED_RAD
-        )
+
+def _is_curved(evidence: Evidence, run: int, m: int) -> bool:
+    """Return whether the command of a movement strays from straight ramps."""
+    settled, time = evidence.settled, as_floats(evidence.runs["time"].values)
+    start, end = settled.movements.start[run, m], settled.end[run, m]
+    when = time[(time >= start) & (time <= end)]
+    straight = settled.movements[run : run + 1].reference(when)[0]
+    strays = np.abs(command_at(evidence, run, when) - straight).max(initial=0.0)
+    return bool(strays > CURVED_RAD)
 
 
 def _joined(
-    settled: SettledEvidence, found: dict[tuple[int, int], list[_Moment]]
+    settled: SettledEvidence, found: dict[tuple[int, int], list[_Moment]], lag_s: float
 ) -> SettledEvidence:
-    """Return settled positions with moments on the way in place of movements without."""
+    """Return settled positions with moments on the way: in place of movements without, or before.
+
+    Args:
+        settled: Settled positions.
+        found: Moments on the way of some movements.
+        lag_s: How far the tool trails its commands [s].
+    """
     movements = settled.movements
     origin = movements.origin()
-    nothing: list[_Moment | None] = [None]
+
+    def entries(run: int, m: int) -> list[tuple[int, _Moment | None]]:
+        way: list[_Moment | None] = list(found.get((run, m), ()))
+        rests = bool(settled.usable[run, m]) or not way
+        return [(m, moment) for moment in (*way, *([None] * rests))]
+
     plan = [
-        [
-            (m, moment)
-            for m in np.flatnonzero(movements.exists[run]).tolist()
-            for moment in (found.get((run, m)) or nothing)
-        ]
+        [one for m in np.flatnonzero(movements.exists[run]).tolist() for one in entries(run, m)]
         for run in range(len(settled.usable))
     ]
     count = max(len(one) for one in plan)
@@ -265,8 +289,8 @@ def _joined(
     made = SettledEvidence.empty(run=len(plan), movement=count, motor=motors, axis=axes)
     stretches = Stretches.empty(run=len(plan), movement=count, motor=motors)
     stretches.initial[:] = movements.initial
-    for run, entries in enumerate(plan):
-        for k, (m, moment) in enumerate(entries):
+    for run, told in enumerate(plan):
+        for k, (m, moment) in enumerate(told):
             made.put((run, k), settled[run, m])
             stretches.target[run, k] = movements.target[run, m]
             stretches.ramp_duration[run, k] = movements.ramp_duration[run, m]
@@ -275,6 +299,8 @@ def _joined(
             stretches.movement[run, k] = m
             if moment is not None:
                 _put(made, stretches, (run, k), moment)
+            elif way := found.get((run, m)):
+                _put_rest(stretches, (run, k), way[-1], lag_s)
     return replace(made, movements=stretches)
 
 
@@ -289,8 +315,18 @@ def _put(made: SettledEvidence, stretches: Stretches, at: tuple[int, int], momen
     stretches.direction[at] = moment.direction
 
 
+def _put_rest(stretches: Stretches, at: tuple[int, int], before: _Moment, lag_s: float) -> None:
+    """Write that the last stretch of a curve, up to where the tool rests, begins at a moment."""
+    begun = before.time - lag_s
+    left = stretches.start[at] + stretches.ramp_duration[at] - begun
+    stretches.start[at], stretches.beginning[at] = begun, before.target
+    stretches.ramp_duration[at] = np.maximum(left, LEAST_RAMP_S)
+    stretches.whole[at], stretches.curved[at] = False, True
+
+
 def beside(moving: TransientSamples, moments: SettledEvidence) -> TransientSamples:
     """Return readings on the way without those of moments, movement by movement of these."""
     stretches = Stretches.of(moments.movements)
     runs = np.arange(len(stretches.movement))[:, None]
-    return moving[runs, stretches.movement].where(stretches.at_rest & stretches.exists)
+    whole = stretches.at_rest & stretches.exists & stretches.whole
+    return moving[runs, stretches.movement].where(whole)
