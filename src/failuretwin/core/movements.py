@@ -55,6 +55,11 @@ class Movements(ArrayStruct):
         """Which entries are movements, not padding, (run, movement)."""
         return np.isfinite(self.start)
 
+    def travel(self, run: int) -> FloatArray:
+        """Return how far apart the lowest and the highest targets of a run are, (motor,) [rad]."""
+        told = np.concatenate([self.initial[run : run + 1], self.target[run][self.exists[run]]])
+        return np.asarray(np.ptp(told, axis=0))
+
     def origin(self) -> FloatArray:
         """Return the reference at the start of each movement, (run, movement, motor) [rad].
 

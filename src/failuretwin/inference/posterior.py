@@ -384,7 +384,7 @@ class Posterior:
         if not undecided:
             diagnosis = replace(diagnosis, evidence=self._evidence(run, order, place))
             estimate = best.estimate(run)
-            losses = self._losses(run, estimate, ranked[0])
+            losses = [*self._losses(run, estimate, ranked[0]), *self._not_shown(run)]
             diagnosis = _with_estimate(diagnosis, ranked[0], estimate, place, robot)
             if not ranked[0].known:
                 diagnosis = replace(diagnosis, residual=motor_residual(self.likelihood, run))
@@ -420,6 +420,51 @@ class Posterior:
             motors,
             faulty,
         )
+
+    def _not_shown(self, run: int) -> list[str]:
+        """Return what the motion of a run that may be healthy does not show, a line a motor.
+
+        A run that says nothing of a hypothesis leaves its odds beside healthy as they were.
+        """
+        healthy = np.flatnonzero([h.is_healthy for h in self.hypotheses])
+        if np.exp(self.log_posterior[run, healthy]).sum() < LEAST_HEALTHY:
+            return []
+        gain = self.log_posterior[run] - self.log_prior
+        gain = gain - gain[healthy[0]]
+        untold = (gain > -AGAINST_NATS) & (gain < FOR_NATS)
+        model, lines = self.likelihood.model, []
+        travel = self.likelihood.evidence.movements.travel(run)
+        for k, motor in enumerate(model.motor_names):
+            own = [i for i, h in enumerate(self.hypotheses) if _is_of(h, motor)]
+            held = [i for i in own if _is_held(self.hypotheses[i])]
+            moved = f"{motor.replace('_', ' ')} moved {_told_travel(model.twin.robot, k, travel)}"
+            if own and untold[own].all():
+                lines.append(f"{moved}: little can be said of it")
+            elif untold[held].any():
+                lines.append(f"{moved}: if it is stuck, this hardly shows")
+        return lines
+
+
+LEAST_HEALTHY = 0.05
+"""Probability of healthy from which it is told what a motion does not show."""
+AGAINST_NATS, FOR_NATS = 3.0, 1.0
+"""A run that speaks against a fault or for it by less says little of it."""
+
+
+def _is_of(hypothesis: Hypothesis, motor: str) -> bool:
+    """Return whether a hypothesis is a single fault of a motor."""
+    return [fault.motor for fault in hypothesis.faults] == [motor]
+
+
+def _is_held(hypothesis: Hypothesis) -> bool:
+    return all(MODES[fault.mode].signature is Signature.HELD for fault in hypothesis.faults)
+
+
+def _told_travel(robot: Robot, motor: int, travel: FloatArray) -> str:
+    """Return how far a motor was told to go, between the ends of its way."""
+    if robot.slides[motor]:
+        return f"{1e3 * travel[motor]:.0f} mm"
+    return f"{np.rad2deg(travel[motor]):.0f} deg"
 
 
 def compute_posterior(

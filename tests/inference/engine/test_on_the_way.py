@@ -136,6 +136,14 @@ def test_a_motor_that_stops_on_a_curve_is_found_where_the_tool_rests_behind_it()
     assert found.onset_90[0] <= 3.5 <= found.onset_90[1]
 
 
+def test_a_motor_that_hardly_moves_is_named():
+    command = curve()
+    command[:, 2] = 0.3
+    (found,) = ft.diagnose(exact_run(command, 0.0), ROBOT, "generic")
+    told = [line for line in found.explanation if " moved " in line]
+    assert told == ["motor 3 moved 0 deg: if it is stuck, this hardly shows"]
+
+
 def test_points_of_an_arm_without_lag_are_those_of_the_command():
     healthy = model()
     for command in (zigzag(), curve()):
