@@ -136,6 +136,33 @@ def test_a_motor_that_stops_on_a_curve_is_found_where_the_tool_rests_behind_it()
     assert found.onset_90[0] <= 3.5 <= found.onset_90[1]
 
 
+@pytest.mark.parametrize("sensing", ["encoders", "tool+encoders"])
+def test_encoders_are_read_on_the_way(sensing):
+    command, time = curve(), STEP_S * np.arange(len(curve()))
+    stuck = command.copy()
+    stuck[350:, 1] = stuck[350, 1]
+    runs, seen = exact_run(command, 0.0), np.full(command.shape, np.nan)
+    seen[::10] = stuck[::10]
+    tool = np.where(np.isfinite(seen[:, :1]), DigitalTwin(ROBOT).path(stuck), np.nan)
+    runs = runs.assign(
+        measured=(runs["measured"].dims, tool[None]),
+        position=(("run", "time", "motor"), seen[None]),
+    )
+    (found,) = ft.BayesDiagnoser(ROBOT, "generic", sensing=sensing).diagnose(runs)
+    assert str(found.diagnosis) == "motor_2:stuck"
+    assert found.magnitude == pytest.approx(stuck[350, 1], abs=0.02)
+    assert found.onset_90[0] <= time[350] <= found.onset_90[1]
+    healthy = np.where(np.isfinite(seen), command, np.nan)
+    tool = np.where(np.isfinite(seen[:, :1]), DigitalTwin(ROBOT).path(command), np.nan)
+    (found,) = ft.BayesDiagnoser(ROBOT, "generic", sensing=sensing).diagnose(
+        runs.assign(
+            measured=(runs["measured"].dims, tool[None]),
+            position=(("run", "time", "motor"), healthy[None]),
+        )
+    )
+    assert str(found.diagnosis) == "healthy"
+
+
 def test_a_motor_that_hardly_moves_is_named():
     command = curve()
     command[:, 2] = 0.3

@@ -311,8 +311,22 @@ def _filter(tables: Tables, picks: Places, noise: Noise, found: RowsPosterior) -
             if picks.usable[i, m]:
                 _put_aside(found, i, m, f, whole)
                 found.log_evidence[i, m] = _integrate(tables, picks, noise, found, i, m, scale)
+                if np.isnan(found.log_evidence[i, m]):
+                    _leave_out(found, i, m, noise)
                 _take(f, whole, m * channels, found.alpha[i, m], found.curvature[i, m])
         _conclude(found, i, f, whole)
+
+
+@compiled
+def _leave_out(found: RowsPosterior, i: int, m: int, noise: Noise) -> None:
+    """Write that a moment is an outlier: what is known of it beforehand is exact but for rounding.
+
+    Many channels without noise leave covariances that double precision cannot hold.
+    """
+    found.log_evidence[i, m] = noise.log_outlier
+    found.share[i, m] = 0.0
+    found.alpha[i, m] = 0.0
+    found.curvature[i, m] = 0.0
 
 
 @compiled

@@ -135,7 +135,7 @@ def on_the_way(evidence: Evidence, model: HealthyModel, lag_s: float) -> Settled
     hardly &= ~strays_between(evidence, model, hardly, lag_s)
     unseen = settled.movements.exists & ~settled.usable & _few_rests(evidence, model)[:, None]
     unseen = (unseen | long_curves(evidence)) & hardly[:, None]
-    if not model.sensors.tool_alone or not unseen.any():
+    if not unseen.any():
         return settled
     looks = _Looks(evidence, model, lag_s)
     found = {(run, m): looks.moments(run, m) for run, m in np.argwhere(unseen).tolist()}
