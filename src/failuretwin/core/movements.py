@@ -118,6 +118,11 @@ class Movements(ArrayStruct):
         return times, values
 
 
+AGES_S = np.array([0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 1.0])
+"""How long before a reading it is kept what motors were told: a motor with a dead time follows
+that."""
+
+
 @dataclass(frozen=True)
 class Stretches(Movements):
     """Movements up to one reading each, at rest or on the way.
@@ -134,6 +139,8 @@ class Stretches(Movements):
         whole: Whether a stretch is all that is seen of its movement, (run, movement).
         curved: Whether its movement is a curve, not straight ramps, (run, movement).
         movement: Index of its movement, (run, movement).
+        before: Reference `AGES_S` before the reading, (run, movement, motor, age) [rad]; NaN at
+            rest.
     """
 
     beginning: Annotated[FloatArray, Axes("run", "movement", "motor", empty=np.nan)]
@@ -145,6 +152,7 @@ class Stretches(Movements):
     whole: Annotated[BoolArray, Axes("run", "movement", empty=True)]
     curved: Annotated[BoolArray, Axes("run", "movement", empty=False)]
     movement: Annotated[IntArray, Axes("run", "movement", empty=0)]
+    before: Annotated[FloatArray, Axes("run", "movement", "motor", "age", empty=np.nan)]
 
     @classmethod
     def of(cls, movements: Movements) -> Stretches:
@@ -152,7 +160,7 @@ class Stretches(Movements):
         if isinstance(movements, Stretches):
             return movements
         runs, count, motors = movements.target.shape
-        found = cls.empty(run=runs, movement=count, motor=motors)
+        found = cls.empty(run=runs, movement=count, motor=motors, age=len(AGES_S))
         found.movement[:] = np.arange(count)
         found.beginning[:] = movements.origin()
         known = ("initial", "target", "ramp_duration", "start")

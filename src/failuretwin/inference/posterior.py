@@ -440,13 +440,15 @@ class Posterior:
             moved = f"{motor.replace('_', ' ')} moved {_told_travel(model.twin.robot, k, travel)}"
             if own and untold[own].all():
                 lines.append(f"{moved}: little can be said of it")
-            elif untold[held].any():
+            elif untold[held].any() and travel[k] < HARDLY * model.least_visible[k]:
                 lines.append(f"{moved}: if it is stuck, this hardly shows")
         return lines
 
 
 LEAST_HEALTHY = 0.05
 """Probability of healthy from which it is told what a motion does not show."""
+HARDLY = 5.0
+"""A motor that moves less hardly moves, in the smallest angle of it that shows."""
 AGAINST_NATS, FOR_NATS = 3.0, 1.0
 """A run that speaks against a fault or for it by less says little of it."""
 

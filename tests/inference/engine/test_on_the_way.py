@@ -136,6 +136,21 @@ def test_a_motor_that_stops_on_a_curve_is_found_where_the_tool_rests_behind_it()
     assert found.onset_90[0] <= 3.5 <= found.onset_90[1]
 
 
+def test_a_motor_that_follows_later_is_found_and_timed():
+    command, time = curve(), STEP_S * np.arange(len(curve()))
+    late = command.copy()
+    late[:, 1] = np.interp(np.where(time < 3.5, time, time - 0.2), time, command[:, 1])
+    runs, seen = exact_run(command, 0.0), np.full((len(command), 3), np.nan)
+    seen[::10] = DigitalTwin(ROBOT).path(late[::10])
+    modes = ("stuck", "steady_state_error", "lag")
+    hypotheses = ["healthy", *(f"motor_{k}:{mode}" for k in (1, 2, 3) for mode in modes)]
+    runs = runs.assign(measured=(runs["measured"].dims, seen[None]))
+    (found,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=hypotheses)
+    assert str(found.diagnosis) == "motor_2:lag"
+    assert found.magnitude == pytest.approx(0.2, abs=0.03)
+    assert found.onset_90[0] <= 3.5 <= found.onset_90[1]
+
+
 @pytest.mark.parametrize("sensing", ["encoders", "tool+encoders"])
 def test_encoders_are_read_on_the_way(sensing):
     command, time = curve(), STEP_S * np.arange(len(curve()))

@@ -53,6 +53,8 @@ class Moments:
         done: Share of the movement that each motor had made, (run, moment, motor).
         kept: Probability that what became of the moment before holds on, (run, moment): 1 in one
             ramp, 0 with a new movement.
+        behind: How far a motor that follows `AGES_S` later is behind the command, (run, moment,
+            motor, age) [rad]; 0 at rest.
     """
 
     point: FloatArray
@@ -72,6 +74,7 @@ class Moments:
     late: FloatArray
     done: FloatArray
     kept: FloatArray
+    behind: FloatArray
 
     @property
     def bent(self) -> FloatArray:
@@ -132,6 +135,7 @@ def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
         late=(speed * model.start_jitter_s) ** 2,
         done=movements.done,
         kept=_kept(movements, way),
+        behind=np.nan_to_num(movements.before - movements.before[..., :1]),
     )
     late = np.maximum(model.late(movements, evidence.first_reading_delay), LATE_RATE)
     return _with_waiting(found, np.where(way & movements.whole, late, 0.0))

@@ -1,4 +1,4 @@
-"""A motor that settles off its target by a size that holds for the run, or by one that grows.
+"""A motor that is off by a size that holds for the run, or grows, or that is so much later.
 
 Section: docs/inference.md#hypotheses
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from failuretwin.core.movements import AGES_S
 from failuretwin.core.numerics import log_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.settling import sag
@@ -44,7 +45,8 @@ def offset_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
         log_prior, first = log_of(intervals.weights(early)), np.arange(count)
         since = np.full((1, 1, 1), LONG_S)
         onsets, shares = intervals.samples(early)
-    angle = _offset_angle(scene, motor, mode, since)
+    late = mode.signature is Signature.TRANSIENT
+    angle = _late_angle(scene, motor, mode) if late else _offset_angle(scene, motor, mode, since)
     moving = MovedMotor(scene, motor, False, angle, first)
     low, high = sizes.ends
     grid = coarse_sizes(low, high)
@@ -93,6 +95,29 @@ def _offset_angle(scene: Scene, motor: int, mode: FaultMode, since: FloatArray) 
         return settled[..., motor, None] + off
 
     return angle
+
+
+def _late_angle(scene: Scene, motor: int, mode: FaultMode) -> Angle:
+    """Return the angle of a motor on its way by the size of its dead time."""
+    behind = scene.moments.behind[:, :, motor]  # (run, moment, age)
+
+    def angle(x: FloatArray, outcome: IntArray) -> FloatArray:
+        settled, late = taken(scene.pose, outcome), mode.dead_time(x)
+        place = np.interp(late, AGES_S, np.arange(len(AGES_S), dtype=np.float64))
+        low = np.minimum(place.astype(np.int64), len(AGES_S) - 2)
+        run = np.arange(len(behind))[:, None, None]
+        before, after = (behind[run, :, low + k] for k in (0, 1))  # (run, row, node, moment)
+        off = np.swapaxes(before + (place - low)[..., None] * (after - before), 2, 3)
+        return settled[..., motor, None] + off
+
+    return angle
+
+
+def is_late(mode: FaultMode) -> bool:
+    """Return whether a fault is that a motor follows its command later, and nothing else."""
+    one = np.ones(1)
+    transient = mode.signature is Signature.TRANSIENT
+    return transient and mode.dead_time(one)[0] > 0.0 and mode.ramp_factor(one)[0] == 1.0
 
 
 def _size_prior(sizes: SizePrior, signed: bool) -> AmountPrior:

@@ -25,7 +25,7 @@ from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.filter import RowsPosterior
 from failuretwin.inference.engine.healthy_rows import healthy_rows
 from failuretwin.inference.engine.held_rows import held_rows
-from failuretwin.inference.engine.offset_rows import offset_rows
+from failuretwin.inference.engine.offset_rows import is_late, offset_rows
 from failuretwin.inference.engine.picks import Part, Picks, Prepared, narrowed, prepared
 from failuretwin.inference.engine.redrawn_rows import redrawn_rows
 from failuretwin.inference.engine.rows import Rows, Scene
@@ -84,12 +84,19 @@ def _by_components(picks: Picks, run: IntArray, component: IntArray) -> Picks:
     return Picks(picks.run[pick], picks.row[pick], component[of])
 
 
-def has_rows(hypothesis: Hypothesis) -> bool:
-    """Return whether rests tell of a hypothesis: healthy, or one motor that settles off."""
+def has_rows(hypothesis: Hypothesis, moving: bool = False) -> bool:
+    """Return whether moments tell of a hypothesis: healthy, or one motor that settles off.
+
+    Args:
+        hypothesis: What may be the case.
+        moving: Whether there are moments on the way, which tell of one motor that is late too.
+    """
     if not hypothesis.known or len(hypothesis.faults) > 1:
         return False
-    signatures = {MODES[fault.mode].signature for fault in hypothesis.faults}
-    return not signatures & {Signature.TRANSIENT, Signature.MISSED}
+    modes = [MODES[fault.mode] for fault in hypothesis.faults]
+    if moving and any(map(is_late, modes)):
+        return True
+    return all(mode.signature not in (Signature.TRANSIENT, Signature.MISSED) for mode in modes)
 
 
 def rows_of(scene: Scene, hypothesis: Hypothesis) -> Rows:

@@ -99,7 +99,7 @@ class Weighing:
     @cached_property
     def with_rows(self) -> IntArray:
         """Hypotheses with rows."""
-        return np.flatnonzero([has_rows(h) for h in self.hypotheses])
+        return np.flatnonzero([has_rows(h, self.layout.moving) for h in self.hypotheses])
 
     @cached_property
     def evidence(self) -> RunsEvidence:

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from failuretwin.core.compiled import compiled
-from failuretwin.core.movements import Stretches
+from failuretwin.core.movements import AGES_S, Stretches
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.inference.observation.between_commands import strays_between
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
@@ -84,6 +84,7 @@ class _Moment:
     done: FloatArray
     whole: bool
     curved: bool
+    before: FloatArray
 
 
 def hardly_rest(evidence: Evidence, model: HealthyModel) -> BoolArray:
@@ -223,6 +224,7 @@ class _Looks:
             else np.ones_like(ramp),
             not curved,
             curved,
+            told(time[at] - AGES_S).T,
         )
 
     def _friction(self, run: int, when: float) -> FloatArray:
@@ -287,7 +289,7 @@ def _joined(
     count = max(len(one) for one in plan)
     motors, axes = movements.initial.shape[1], settled.point.shape[-1]
     made = SettledEvidence.empty(run=len(plan), movement=count, motor=motors, axis=axes)
-    stretches = Stretches.empty(run=len(plan), movement=count, motor=motors)
+    stretches = Stretches.empty(run=len(plan), movement=count, motor=motors, age=len(AGES_S))
     stretches.initial[:] = movements.initial
     for run, told in enumerate(plan):
         for k, (m, moment) in enumerate(told):
@@ -312,7 +314,7 @@ def _put(made: SettledEvidence, stretches: Stretches, at: tuple[int, int], momen
     stretches.speed[at], stretches.at_rest[at] = moment.speed, False
     stretches.whole[at], stretches.curved[at] = moment.whole, moment.curved
     stretches.bend[at], stretches.done[at] = moment.bend, moment.done
-    stretches.direction[at] = moment.direction
+    stretches.direction[at], stretches.before[at] = moment.direction, moment.before
 
 
 def _put_rest(stretches: Stretches, at: tuple[int, int], before: _Moment, lag_s: float) -> None:
