@@ -81,7 +81,7 @@ def test_normalised_angles_span_the_range_that_the_map_gives(tmp_path):
     np.testing.assert_allclose(
         np.rad2deg(runs["command"][0, -1]), [88.0, -100.0, 97.0, 38.0, 36.0], atol=1e-4
     )
-    assert runs.attrs["source"].startswith("LeRobot v3.0, angles in normalised (stated);")
+    assert runs.attrs["source"].startswith("LeRobot v3.0, angles in normalised (stated), without the readings of ")
 
 
 def test_where_a_command_is_clipped_nothing_is_read(tmp_path):
@@ -92,6 +92,9 @@ def test_where_a_command_is_clipped_nothing_is_read(tmp_path):
 
     seen = np.flatnonzero(np.isfinite(runs["position"].values[0]).all(axis=1))
     assert len(seen) == 40
+    episodes = runs.sizes["run"]
+    left_out = f"{20 * episodes} of {60 * episodes} frames: a command is clipped at -100 or 100"
+    assert f"(stated), without the readings of {left_out}" in runs.attrs["source"]
     assert runs["time"].values[seen[-1]] == pytest.approx(39 / 30, abs=0.006)
 
 

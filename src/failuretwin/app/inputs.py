@@ -15,7 +15,7 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis, parse_hypotheses
 from failuretwin.data_knowledge.readers.bag_messages import BagTopics
 from failuretwin.data_knowledge.readers.column_guess import column_map_text
 from failuretwin.data_knowledge.readers.column_map import CORRECTION, read_column_map
-from failuretwin.data_knowledge.readers.lerobot import is_lerobot, lerobot_map_text
+from failuretwin.data_knowledge.readers.lerobot import CLIPPED, is_lerobot, lerobot_map_text
 from failuretwin.data_knowledge.readers.lerobot_units import GUESSED, LeRobotAngles
 from failuretwin.data_knowledge.readers.read import ReadOptions, find_logs, read_logs
 from failuretwin.data_knowledge.run_pieces import RunPieces
@@ -54,8 +54,9 @@ def read_inputs(
     if correction is not None:
         runs = correction.runs(runs)
     source = str(runs.attrs.get("source", ""))
-    if source.startswith("LeRobot") and GUESSED in source:
-        tell(f"note: {source.rpartition('; ')[0]}. State it with --columns MAP.toml", err=True)
+    if source.startswith("LeRobot") and (GUESSED in source or CLIPPED in source):
+        told = ". State it with --columns MAP.toml" if GUESSED in source else ""
+        tell(f"note: {source.rpartition('; ')[0]}{told}", err=True)
     return runs
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from failuretwin.core.errors import InputError, check_name, needs_extra
 from failuretwin.core.foreign import check_size, files_below, read_text, reading
-from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.data_knowledge.readers.column_map import map_text
 from failuretwin.data_knowledge.readers.lerobot_units import (
     FULL_SCALE,
@@ -97,7 +97,7 @@ def read_lerobot(path: Path, robot: Robot, angles: LeRobotAngles | None = None) 
     return LeRobotEpisodes(
         [_episode(frames, n, float(rate), found, path, robot) for n in np.unique(frames[EPISODE])],
         found,
-        f"LeRobot {version}, angles in {found.unit} ({how})",
+        f"LeRobot {version}, angles in {found.unit} ({how}){_left_out(frames[ACTION], found)}",
         channels,
         channel_of[STATE],
     )
@@ -204,14 +204,30 @@ def _episode(
     rows = frames[EPISODE] == number
     frame, action, state = (frames[name][rows] for name in (FRAME, ACTION, STATE))
     time = as_floats((frame - frame[0]) / rate_hz)
-    if known.unit == NORMALISED:
-        free = np.all(np.abs(action) < FULL_SCALE, axis=1, keepdims=True)
-        state = np.where(free, state, np.nan)
+    state = np.where(_at_an_end(action, known)[:, None], np.nan, state)
     return TimedLog(
         name=f"{path.resolve().name}/episode_{int(number):06d}",
         command=Samples(time, known.to_rad(action, robot)),
         position=Samples(time, known.to_rad(state, robot)),
     )
+
+
+CLIPPED = "without the readings of"
+"""Said of a data set whose commands end at the ends of a range."""
+
+
+def _at_an_end(action: FloatArray, known: LeRobotAngles) -> BoolArray:
+    """Return the frames in which a normalised command is at an end of its range, (frame,)."""
+    at_end = np.any(np.abs(action) >= FULL_SCALE, axis=1)
+    return np.asarray(at_end & (known.unit == NORMALISED))
+
+
+def _left_out(action: FloatArray, known: LeRobotAngles) -> str:
+    """Return how many frames are not read, in words; empty: none."""
+    count = int(_at_an_end(action, known).sum())
+    if not count:
+        return ""
+    return f", {CLIPPED} {count} of {len(action)} frames: a command is clipped at -100 or 100"
 
 
 HINTS = """\
