@@ -92,8 +92,7 @@ def test_where_a_command_is_clipped_nothing_is_read(tmp_path):
 
     seen = np.flatnonzero(np.isfinite(runs["position"].values[0]).all(axis=1))
     assert len(seen) == 40
-    episodes = runs.sizes["run"]
-    left_out = f"{20 * episodes} of {60 * episodes} frames: a command is clipped at -100 or 100"
+    left_out = "70 of 150 frames: a command is clipped at -100 or 100"
     assert f"(stated), without the readings of {left_out}" in runs.attrs["source"]
     assert runs["time"].values[seen[-1]] == pytest.approx(39 / 30, abs=0.006)
 
