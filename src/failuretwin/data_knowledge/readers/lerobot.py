@@ -129,8 +129,10 @@ def _channels(
             how_often = "no channel" if not hits else f"{len(hits)} channels"
             raise InputError(
                 f"{path}: {feature!r} has {how_often} called {joint!r}. It has: "
-                f"{', '.join(names)}. Name those of {', '.join(robot.motor_names)} in this order "
-                "as joints in the [lerobot] table of a map (--columns)."
+                f"{', '.join(names)}. Its robot is {info.get('robot_type', 'not named')}: choose "
+                f"the profile with --robot, here {robot.name}. Or name the channels of "
+                f"{', '.join(robot.motor_names)} in this order as joints in the [lerobot] table of "
+                "a map (--columns)."
             )
         found += hits
     return found
