@@ -165,6 +165,15 @@ def test_a_guess_is_said_and_one_option_settles_it(failuretwin, tmp_path, health
     assert "joint offsets: none found; 5 of 5 joints follow their commands" in told.stdout
 
 
+def test_a_joint_that_does_not_follow_its_commands_is_named(failuretwin, tmp_path, healthy):
+    frozen = [(action, np.array(state)) for action, state in healthy]
+    for _, state in frozen:
+        state[:, 4] = state[0, 4]
+    told = failuretwin("diagnose", written(tmp_path / "pick", frozen), *SO101)
+    assert "4 of 5 joints follow their commands and stop often enough" in told.stdout
+    assert "not motor 5 (wrist roll)" in told.stdout
+
+
 def test_episodes_are_diagnosed_alone_and_as_a_life(failuretwin, tmp_path):
     stuck = simulated_counts(4, seed=3, hypothesis="motor_2:stuck")
     folder = written(tmp_path / "pick", stuck)

@@ -65,8 +65,17 @@ def offset_lines(
         return [*lines, _corrected(reading.logs[0], out, known.robot, angles, offsets)]
     if lines:
         return [*lines, "--correct OUT writes a copy of the data set without it"]
-    judged = f"{len(offsets)} of {len(known.robot.motors)} joints"
-    return [f"joint offsets: none found; {judged} follow their commands and stop often enough"]
+    return [f"joint offsets: none found; {_judged(offsets, known.robot)}"]
+
+
+def _judged(offsets: Sequence[JointOffset], robot: Robot) -> str:
+    """Return how many joints could be judged, and which could not."""
+    judged = {offset.motor for offset in offsets}
+    others = [name.replace("_", " ") for name in robot.motor_names if name not in judged]
+    text = (
+        f"{len(judged)} of {len(robot.motors)} joints follow their commands and stop often enough"
+    )
+    return joint_names_in(f"{text}, not {', '.join(others)}", robot) if others else text
 
 
 def _offsets(
