@@ -25,6 +25,8 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 POINT = "geometry_msgs/msg/PointStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+TRANSFORMS_TEXT = "geometry_msgs/TransformStamped[] transforms"
 
 
 @dataclass(frozen=True)
@@ -67,8 +69,10 @@ def write_bag(folder: Path, form: str, entries, name="run", types=None, declared
         declared: More topics, (name, type), without messages.
     """
     store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.LATEST)
-    for type_, text in {MONITORING: MONITORING_TEXT, **(types or {})}.items():
-        store.register(get_types_from_msg(text, type_))
+    texts = {MONITORING: MONITORING_TEXT, TRANSFORMS: TRANSFORMS_TEXT, **(types or {})}
+    for type_, text in texts.items():
+        if type_ not in store.types:
+            store.register(get_types_from_msg(text, type_))
     if form == "ros1":
         path = folder / f"{name}.bag"
         _write(Writer1(path), store, store.serialize_ros1, entries, declared)

@@ -28,6 +28,7 @@ from bag_writers import (
     POINT,
     POSE,
     TRAJECTORY,
+    TRANSFORMS,
     entry,
     time_of,
     write_bag,
@@ -142,16 +143,40 @@ def test_joint_states_come_back(read, form):
     np.testing.assert_allclose(log.command.time, 0.1 * np.arange(20) + 0.03, rtol=0, atol=1e-12)
 
 
+def transform(k, child, point, base="base_link"):
+    header = {"stamp": time_of(ns(0.1 * k)), "frame_id": base}
+    return {"header": header, "child_frame_id": child, "transform": {"translation": point}}
+
+
+def test_transforms_that_joint_states_tell_are_no_tool(read):
+    """A state publisher writes one for each joint: none leads from base to tool."""
+    values = np.random.default_rng(1).normal(size=(20, 6))
+    entries = [state(0.1 * k, values[k], names=ALL_JOINTS) for k in range(20)]
+    entries += [
+        entry("/tf", TRANSFORMS, ns(0.1 * k), transforms=[transform(k, "link5", {}, "link4")])
+        for k in range(20)
+    ]
+    entries.append(plan(0.5, [(0.6, values[0])], names=ALL_JOINTS))
+    log = read(entries, "mcap")
+
+    assert log.tool is None
+    np.testing.assert_array_equal(log.position.value, values[:, OURS])
+
+
 @EVERY_FORMAT
-@pytest.mark.parametrize("kind", [POINT, POSE])
+@pytest.mark.parametrize("kind", [POINT, POSE, TRANSFORMS])
 def test_tool_and_trajectories_come_back(read, form, kind):
     rng = np.random.default_rng(2)
     path, targets = rng.normal(size=(30, 3)), rng.normal(size=(3, 6))
     entries = []
     for k, xyz in enumerate(path):
         point = dict(zip("xyz", xyz, strict=True))
-        content = {"point": point} if kind == POINT else {"pose": {"position": point}}
-        entries.append(entry("/tracker/tool", kind, ns(0.1 * k), **content))
+        content = {
+            POINT: {"point": point},
+            POSE: {"pose": {"position": point}},
+            TRANSFORMS: {"transforms": [transform(k, "link5", point), transform(k, "lid", {})]},
+        }
+        entries.append(entry("/tracker/tool", kind, ns(0.1 * k), **content[kind]))
     entries.append(plan(0.5, [(0.6, targets[0]), (1.4, targets[1])], names=ALL_JOINTS))
     entries.append(plan(2.5, [(0.8, targets[2])], names=ALL_JOINTS))
     log = read(entries, form)
@@ -533,7 +558,8 @@ def test_topic_that_cannot_be_what_it_is_named(tmp_path, armpi):
     text = refused(tmp_path, armpi, [*readings(), *commands()], BagTopics(tool="/joint_states"))
     assert text == (
         "BAG: topic /joint_states (sensor_msgs/msg/JointState, 5 messages) cannot be the tool. "
-        "Expected geometry_msgs/msg/PointStamped, geometry_msgs/msg/PoseStamped."
+        "Expected geometry_msgs/msg/PointStamped, geometry_msgs/msg/PoseStamped, "
+        "tf2_msgs/msg/TFMessage."
     )
 
 
@@ -568,7 +594,7 @@ def test_nothing_understood_lists_what_is_there(tmp_path, armpi):
         "BAG: holds no messages that are understood. Expected messages with header, name, "
         "position, temperature and voltage, sensor_msgs/msg/JointState, "
         "trajectory_msgs/msg/JointTrajectory, geometry_msgs/msg/PointStamped, "
-        "geometry_msgs/msg/PoseStamped. Found: /rosout (std_msgs/msg/String, 3 messages)."
+        "geometry_msgs/msg/PoseStamped, tf2_msgs/msg/TFMessage. Found: /rosout (std_msgs/msg/String, 3 messages)."
     )
 
 

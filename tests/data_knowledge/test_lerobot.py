@@ -81,7 +81,9 @@ def test_normalised_angles_span_the_range_that_the_map_gives(tmp_path):
     np.testing.assert_allclose(
         np.rad2deg(runs["command"][0, -1]), [88.0, -100.0, 97.0, 38.0, 36.0], atol=1e-4
     )
-    assert runs.attrs["source"].startswith("LeRobot v3.0, angles in normalised (stated), without the readings of ")
+    assert runs.attrs["source"].startswith(
+        "LeRobot v3.0, angles in normalised (stated), without the readings of "
+    )
 
 
 def test_where_a_command_is_clipped_nothing_is_read(tmp_path):

@@ -24,6 +24,7 @@ from failuretwin.data_knowledge.readers.bag_messages import (
     BagMessage,
     Kind,
     Role,
+    ToolFrames,
     check_role,
     kind_of_type,
     topic_rows,
@@ -57,7 +58,7 @@ class RosTopics:
             is computed from them.
         position_type: Its type: a JointState or a message with the authors' fields.
         tool: Topic of the tool's position in the base frame; empty: none.
-        tool_type: Its type: a PointStamped or a PoseStamped.
+        tool_type: Its type: a PointStamped, a PoseStamped or a TFMessage.
         goal: Topic of the goals that the motors report as received; empty: none.
         goal_type: Its type: a JointState or a message with the authors' fields.
         diagnostics: Topic of the diagnosis.
@@ -205,7 +206,8 @@ class RosReader:
             InputError: If it is invalid.
         """
         check_role(self._role, kind, f"{self._where}: {kind.value}")
-        rows = topic_rows([BagMessage(received_ns, content)], kind, self._role, self._where)
+        message, frames = BagMessage(received_ns, content), ToolFrames.of(self._robot)
+        rows = topic_rows([message], kind, self._role, self._where, frames)
         if self._role != "tool":
             rows = motor_rows(rows, self._robot)
         self._check(rows.value, LARGEST)

@@ -1,9 +1,9 @@
 """Recorded messages as rows of joint values or tool positions with their stamps.
 
-Understood are the message of the data set's authors, JointState, JointTrajectory, PointStamped
-and PoseStamped; each is known by its fields, whatever its package is called. A message counts at
-its header's stamp: the authors stamp a command before they send it and publish it two seconds
-later. Where the stamp is zero, the time at which the message was received stands in.
+Understood are the message of the data set's authors, JointState, JointTrajectory, PointStamped,
+PoseStamped and TFMessage; each is known by its fields, whatever its package is called. A message
+counts at its header's stamp: the authors stamp a command before they send it and publish it two
+seconds later. Where the stamp is zero, the time at which the message was received stands in.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import MS_PER_S, BoolArray, FloatArray, IntArray, as_floats
+from failuretwin.digital_model.robot import Robot
 
 NS_PER_S = 1_000_000_000
 HEADER = {"header": "std_msgs/msg/Header"}
@@ -34,6 +35,7 @@ class Kind(Enum):
     TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
     POINT = "geometry_msgs/msg/PointStamped"
     POSE = "geometry_msgs/msg/PoseStamped"
+    TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
 Role = Literal["command", "tool", "position", "goal"]
@@ -41,7 +43,7 @@ ROLES: tuple[Role, ...] = get_args(Role)
 
 KINDS: dict[Role, tuple[Kind, ...]] = {
     "command": (Kind.TRAJECTORY, Kind.MONITORING, Kind.JOINT_STATE),
-    "tool": (Kind.POINT, Kind.POSE),
+    "tool": (Kind.POINT, Kind.POSE, Kind.TRANSFORMS),
     "position": (Kind.MONITORING, Kind.JOINT_STATE),
     "goal": (Kind.MONITORING, Kind.JOINT_STATE),
 }
@@ -54,12 +56,32 @@ FIELDS: dict[Kind, dict[str, str]] = {
     | {"joint_names": "string[]", "points": "trajectory_msgs/msg/JointTrajectoryPoint[]"},
     Kind.POINT: HEADER | {"point": "geometry_msgs/msg/Point"},
     Kind.POSE: HEADER | {"pose": "geometry_msgs/msg/Pose"},
+    Kind.TRANSFORMS: {"transforms": "geometry_msgs/msg/TransformStamped[]"},
 }
 """Fields that each kind is known by; all kinds but the first have no others."""
 STANDARD_TYPES = {kind.value.replace("/msg/", "/"): kind for kind in Kind}
 """Kinds of the standard types by their ROS 1 names."""
 GOAL_TOPIC = "/joint_goals"
 """Topic of the goals that motors report, in our recordings."""
+
+
+@dataclass(frozen=True)
+class ToolFrames:
+    """Which transform of a tree says where the tool is.
+
+    Attributes:
+        base: Frame of the robot's base.
+        tools: Frames of its tool, the first that there is counts.
+    """
+
+    base: str
+    tools: tuple[str, ...]
+
+    @classmethod
+    def of(cls, robot: Robot) -> ToolFrames:
+        """Return the frames of the profile, and those that drivers of industrial arms publish."""
+        profile = robot.profile
+        return cls(profile.base_link, ("tool0_controller", profile.tool_link, "tool0"))
 
 
 @dataclass(frozen=True)
@@ -163,10 +185,13 @@ class Rows:
         )
 
 
-def topic_rows(messages: Sequence[BagMessage], kind: Kind, role: Role, where: str) -> Rows:
+def topic_rows(
+    messages: Sequence[BagMessage], kind: Kind, role: Role, where: str, frames: ToolFrames
+) -> Rows:
     """Return the values in the messages of one topic; tool positions without a value are left out.
 
-    The authors' message carries durations if its role is ``command``.
+    The authors' message carries durations if its role is ``command``. Of transforms only one that
+    leads straight from base to tool counts: what joint states alone tell is no tool sensor.
 
     Raises:
         InputError: If names and values do not fit together or a time makes no sense.
@@ -177,6 +202,8 @@ def topic_rows(messages: Sequence[BagMessage], kind: Kind, role: Role, where: st
         parts = [_servo_row(m, where, command=role == "command") for m in messages]
     elif kind is Kind.JOINT_STATE:
         parts = [_state_row(m, where) for m in messages if len(m.content.position)]
+    elif kind is Kind.TRANSFORMS:
+        parts = _transforms(messages, where, frames)
     else:
         rows = [_tool_row(m, kind, where) for m in messages]
         parts = [row for row in rows if np.isfinite(row.value).all()]
@@ -188,6 +215,18 @@ def _tool_row(message: BagMessage, kind: Kind, where: str) -> Rows:
     content = message.content
     point = content.point if kind is Kind.POINT else content.pose.position
     return Rows(where, _stamp(message), as_floats([[point.x, point.y, point.z]]), AXES)
+
+
+def _transforms(messages: Sequence[BagMessage], where: str, frames: ToolFrames) -> list[Rows]:
+    """Return where the tool is by the transforms from the base to the first of its frames."""
+    found: dict[str, list[Rows]] = {name: [] for name in frames.tools}
+    for message in messages:
+        for one in message.content.transforms:
+            child = one.child_frame_id.strip("/")
+            if one.header.frame_id.strip("/") == frames.base and child in found:
+                at, stamp = one.transform.translation, _stamp(BagMessage(message.received_ns, one))
+                found[child].append(Rows(where, stamp, as_floats([[at.x, at.y, at.z]]), AXES))
+    return next((rows for rows in found.values() if rows), [])
 
 
 def _stamp(message: BagMessage) -> IntArray:

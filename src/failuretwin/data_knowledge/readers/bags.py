@@ -28,6 +28,7 @@ from failuretwin.data_knowledge.readers.bag_messages import (
     Kind,
     Role,
     Rows,
+    ToolFrames,
     check_role,
     topic_rows,
 )
@@ -90,8 +91,8 @@ def read_targets(path: Path, robot: Robot) -> Targets | None:
 EXPECTED: dict[Role, str] = {
     "command": "no commands. Expected a JointTrajectory, or joint values on a topic that has "
     "`command` or `position_monitoring` in its name",
-    "position": "neither tool positions nor motor readings. Expected a PointStamped, PoseStamped "
-    "or JointState, or a topic `condition_monitoring`",
+    "position": "neither tool positions nor motor readings. Expected a PointStamped, PoseStamped, "
+    "TFMessage or JointState, or a topic `condition_monitoring`",
 }
 """Text for a recording in which no topic fits a role that is needed."""
 COMMAND_WORDS = ("command", "cmd", "position_monitoring")
@@ -161,7 +162,7 @@ class _Recording:
             InputError: If there are several topics, none that is needed, or a motor is missing.
         """
         read = {topic: self._read(topic, role) for topic in self.fitting[role]}
-        ours = [t for t in read if role == "tool" or _names_a_motor(read[t].names, self.robot)]
+        ours = [topic for topic, rows in read.items() if self._is_ours(topic, rows, role)]
         if len(ours) > 1:
             example = f'{role} = "{ours[0].name}"'
             raise InputError(
@@ -182,7 +183,14 @@ class _Recording:
 
     def _read(self, topic: BagTopic, role: Role) -> Rows:
         kind = cast("Kind", topic.kind)  # one that fits the role
-        return topic_rows(self.messages[topic.name], kind, role, f"{self.path}: topic {topic.name}")
+        where, frames = f"{self.path}: topic {topic.name}", ToolFrames.of(self.robot)
+        return topic_rows(self.messages[topic.name], kind, role, where, frames)
+
+    def _is_ours(self, topic: BagTopic, rows: Rows, role: Role) -> bool:
+        """Return whether a topic tells of this robot; transforms may be of anything."""
+        if role != "tool":
+            return _names_a_motor(rows.names, self.robot)
+        return topic.kind is not Kind.TRANSFORMS or len(rows.stamp_ns) > 0
 
 
 def _suits(role: Role, topic: BagTopic) -> bool:

@@ -70,6 +70,7 @@ class RobotStream:
         """Count all that has come, as if the stream were over: the answer of the batch method."""
         self._fleet.conclude()
         self._judge()
+        self._conclude_watch()
         return self._answer()
 
     def _judge(self) -> None:
@@ -79,6 +80,9 @@ class RobotStream:
 
     def _watch(self, time: float, reference: FloatArray | None, point: FloatArray | None) -> None:
         """Take a sample for what is watched in addition to the motors: nothing."""
+
+    def _conclude_watch(self) -> None:
+        """Count what is watched in addition to the motors, as if the stream were over: nothing."""
 
     def _answer(self) -> Answer:
         """Return what is believed."""

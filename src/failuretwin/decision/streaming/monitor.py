@@ -43,6 +43,10 @@ WORTH_LEARNING = 0.01
 
 FIRST = np.array([0])
 """The only robot of its stream."""
+NOTHING_SEEN = (
+    "the arm has not been seen at rest after a movement yet, nor on its way for long enough"
+)
+"""Why there is no verdict before anything was judged."""
 UNHEARD = 3
 """Commands in a row of which a motor reports that they did not arrive, from which it is told."""
 BEGINS_ODDLY = (
@@ -119,6 +123,7 @@ class FaultMonitor(RobotStream):
         self._way = WayWatch(diagnoser, self._mixture.filters[0]) if learns else None
         self._arrived = np.full((0, len(known.scatter)), np.nan)
         self._rests, self._misfit = False, 0.0
+        self._rested_s: float | None = None
         if len(self._models) == 1 and self._learner is not None and self._learner.movements:
             self._adopt_learned()
 
@@ -170,6 +175,8 @@ class FaultMonitor(RobotStream):
         if self._rests:
             return DEAD.fatal
         alarm, way = self._rule.alarm, self._way
+        if self._rested_s is None and (way is None or way.diagnosis is None):
+            return NOTHING_SEEN
         if way is not None and way.fits and self._diagnosis is way.diagnosis:
             return self._unheard(alarm.cause)
         young = self._set_up.movements <= PROOF and alarm.state == CLEAR
@@ -183,10 +190,20 @@ class FaultMonitor(RobotStream):
         if self._fleet.rounding is None and found is not None:
             self._fleet.count_as_noise(found)
             self._models = [rounded(model, found, None) for model in self._models]
-        hours = 0.0 if self._way is None else self._way.see(time, reference, point)
-        if self._way is not None and hours > 0.0:
-            self._rule.see(self._fleet.time, self._way.posterior, hours)
-            self._diagnosis = self._way.diagnosis
+        way = self._way
+        if way is not None:
+            self._count(way, way.see(time, reference, point, self._rested_s))
+
+    def _conclude_watch(self) -> None:
+        """Judge the last part of a way, if it is long enough."""
+        if self._way is not None:
+            self._count(self._way, self._way.conclude(self._rested_s))
+
+    def _count(self, way: WayWatch, hours: float) -> None:
+        """Count a window on the way of so many hours; 0: none was judged."""
+        if hours > 0.0:
+            self._rule.see(self._fleet.time, way.posterior, hours)
+            self._diagnosis = way.diagnosis
 
     def _unheard(self, cause: str) -> str:
         """Return that commands do not reach the motor that a fault is blamed on; else nothing."""
@@ -203,6 +220,8 @@ class FaultMonitor(RobotStream):
     def _judge(self) -> None:
         """Renew what is believed by what the last movements say."""
         seen, told = self._fleet.seen(0), None
+        if seen is not None and seen[0].usable.any():
+            self._rested_s = self._fleet.time
         on_way = self._way is not None and self._way.diagnosis is not None
         if seen is not None and on_way and not seen[0].usable.any():
             return  # no movement was seen at rest

@@ -32,8 +32,8 @@ from failuretwin.inference.together.fault_filter import MOST_NATS, S_PER_H, Faul
 WINDOW_S = 6.0
 """Length of a window [s]: some moments on the way."""
 PAUSE_S = 0.5
-"""Time without a new command from which an arm may come to rest [s]: such windows are left to what
-sees rests."""
+"""Time without a new command from which an arm may come to rest [s]: windows in which it has are
+left to what sees rests."""
 STILL_RAD = 1e-5
 """Change of a command that is none [rad]."""
 FITTING = 3
@@ -76,13 +76,20 @@ class WayWatch:
         """Whether the log has been seen to fit the profile: what comes later is a fault."""
         return self.fitting >= FITTING
 
-    def see(self, time: float, reference: FloatArray | None, point: FloatArray | None) -> float:
+    def see(
+        self,
+        time: float,
+        reference: FloatArray | None,
+        point: FloatArray | None,
+        rested_s: float | None,
+    ) -> float:
         """Take a sample; return the length of the window that it ends and that was judged [h].
 
         Args:
             time: Time of the stream [s].
             reference: Of every motor, (motor,) [rad]; None: not known.
             point: Tool position, (axis,) [m]; None or NaN: no reading.
+            rested_s: When the arm was last seen at rest [s]; None: never.
         """
         if reference is None or not np.isfinite(reference).all():
             return 0.0
@@ -91,14 +98,30 @@ class WayWatch:
         read = point is not None and bool(np.isfinite(point).all())
         self._samples.append((time, reference, point if read else None))
         lasted = time - self._samples[0][0]
-        if lasted < WINDOW_S:
+        return self._end_window(rested_s) if lasted >= WINDOW_S else 0.0
+
+    def conclude(self, rested_s: float | None) -> float:
+        """Return the length of the last window [h], if it is half as long as others and judged.
+
+        Args:
+            rested_s: As in `see`.
+        """
+        if not self._samples or self._samples[-1][0] - self._samples[0][0] < 0.5 * WINDOW_S:
             return 0.0
+        return self._end_window(rested_s)
+
+    def _end_window(self, rested_s: float | None) -> float:
+        """Judge the samples since the last window; return their length if they were judged [h]."""
         some, self._samples = self._samples, self._samples[-1:]
-        return lasted / S_PER_H if self._judge(some, lasted / S_PER_H) else 0.0
+        rested = rested_s is not None and rested_s >= some[0][0]
+        if rested and _longest_pause(some) > PAUSE_S:
+            return 0.0
+        hours = (some[-1][0] - some[0][0]) / S_PER_H
+        return hours if self._judge(some, hours) else 0.0
 
     def _judge(self, some: Sequence[Sample], hours: float) -> bool:
         """Judge a window; return whether its tool never rests."""
-        runs = None if _longest_pause(some) > PAUSE_S else _as_run(some, self._diagnoser)
+        runs = _as_run(some, self._diagnoser)
         if runs is None:
             return False
         life, seen = self._life, Evidence(runs.to_dataset(), self._life.model.settings)
