@@ -245,7 +245,8 @@ class Bench:
         if spec is None or not str(spec.origin).startswith(str(self.copy)):
             os._exit(70)
         temporary = f"--basetemp={self.scratch / 'tests'}"
-        code = pytest.main(["-q", "-x", "-m", "not slow", "-p", "no:cacheprovider", temporary, *tests])
+        quick = ["-q", "-x", "-m", "not slow", "-p", "no:cacheprovider", temporary]
+        code = pytest.main([*quick, *tests])
         sys.stdout.flush()
         os._exit(int(code))
 

@@ -594,7 +594,8 @@ def test_nothing_understood_lists_what_is_there(tmp_path, armpi):
         "BAG: holds no messages that are understood. Expected messages with header, name, "
         "position, temperature and voltage, sensor_msgs/msg/JointState, "
         "trajectory_msgs/msg/JointTrajectory, geometry_msgs/msg/PointStamped, "
-        "geometry_msgs/msg/PoseStamped, tf2_msgs/msg/TFMessage. Found: /rosout (std_msgs/msg/String, 3 messages)."
+        "geometry_msgs/msg/PoseStamped, tf2_msgs/msg/TFMessage. "
+        "Found: /rosout (std_msgs/msg/String, 3 messages)."
     )
 
 

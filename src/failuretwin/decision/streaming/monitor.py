@@ -22,7 +22,7 @@ from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.decision.streaming.learning import LifeLearner, LifeMemory
 from failuretwin.decision.streaming.set_up_watch import PROOF, SetUpWatch
 from failuretwin.decision.streaming.trouble import DEAD, rests_throughout
-from failuretwin.decision.streaming.way_watch import WayWatch
+from failuretwin.decision.streaming.way_watch import WINDOW_S, WayWatch
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
@@ -124,6 +124,7 @@ class FaultMonitor(RobotStream):
         self._arrived = np.full((0, len(known.scatter)), np.nan)
         self._rests, self._misfit = False, 0.0
         self._rested_s: float | None = None
+        self._began_s = np.inf
         if len(self._models) == 1 and self._learner is not None and self._learner.movements:
             self._adopt_learned()
 
@@ -175,13 +176,19 @@ class FaultMonitor(RobotStream):
         if self._rests:
             return DEAD.fatal
         alarm, way = self._rule.alarm, self._way
-        if self._rested_s is None and (way is None or way.diagnosis is None):
-            return NOTHING_SEEN
         if way is not None and way.fits and self._diagnosis is way.diagnosis:
             return self._unheard(alarm.cause)
         young = self._set_up.movements <= PROOF and alarm.state == CLEAR
         odd = BEGINS_ODDLY if young and self._misfit > FITS else ""
-        return self._set_up.against(alarm) or odd or self._unheard(alarm.cause)
+        known = self._set_up.against(alarm) or odd or self._unheard(alarm.cause)
+        return known or (NOTHING_SEEN if self._saw_nothing else "")
+
+    @property
+    def _saw_nothing(self) -> bool:
+        """Whether movements went by of which none was judged."""
+        judged = self._way is not None and self._way.diagnosis is not None
+        late = self._movements > 0 and self._fleet.time - self._began_s > 2.0 * WINDOW_S
+        return late and self._rested_s is None and not judged
 
     def _watch(self, time: float, reference: FloatArray | None, point: FloatArray | None) -> None:
         """Look at the set-up, count as noise what is rounded off, and judge what never rests."""
@@ -190,7 +197,7 @@ class FaultMonitor(RobotStream):
         if self._fleet.rounding is None and found is not None:
             self._fleet.count_as_noise(found)
             self._models = [rounded(model, found, None) for model in self._models]
-        way = self._way
+        self._began_s, way = min(self._began_s, time), self._way
         if way is not None:
             self._count(way, way.see(time, reference, point, self._rested_s))
 
