@@ -2,7 +2,7 @@
 
     python benchmarks/never_at_rest.py [--robot armpi_fpv ur5e so101 panda] [--motion blended ...]
         [--rate 10] [--calibration generic] [--healthy 20] [--faulty 3] [--clock 0.0] [--folder]
-        [--calibrated 20] [--told] [--watch 120]
+        [--calibrated 20] [--told] [--watch 120] [--rest 5] [--sensing encoders] [--late]
     python benchmarks/never_at_rest.py --logs FOLDER [--share 0.85] [--calibration armpi_fpv]
 
 Five motions, ten seconds each: point to point without a stop, sinusoids, splines as of a leader
@@ -11,6 +11,8 @@ all are of one), drawn from what its class is like: bias, sag, friction, lag; sc
 a second or so. A motor gets stuck at any time, or is off by two to four times what can be seen of
 it: by another error after each stroke, or, on curves, by one that comes in mid-run. With
 `--calibrated N` all are of one robot, calibrated from N healthy runs of the same motion. With
+`--rest` an arm stands still for the last seconds of its runs. With `--late` motors also come to
+follow 0.2 s late, in mid-run, and that is among the hypotheses. With
 `--told` the diagnosis is told the shares of healthy and faulty runs and the sizes of errors as
 drawn: only then can the calibration error be that of chance.
 """
@@ -28,7 +30,7 @@ from scipy.interpolate import CubicSpline
 from telling import calibration, nats, right
 
 import failuretwin as ft
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis, paper_hypotheses
 from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import RunTable, Truth, concatenate
 from failuretwin.core.types import FloatArray, as_floats
@@ -148,12 +150,19 @@ class Case:
     seed: int
 
 
-def cases(robot: Robot, healthy: int, faulty: int, seed: int) -> Iterator[Case]:
+MODES = ("stuck", "steady_state_error")
+LATE, DEAD_S = "lag", 0.2
+"""The mode of motors that come to follow late, and by how much [s]."""
+
+
+def cases(
+    robot: Robot, modes: Sequence[str], healthy: int, faulty: int, seed: int
+) -> Iterator[Case]:
     """Yield healthy runs, and some of each motor and mode."""
     for n in range(healthy):
         yield Case("healthy", -1, seed + n)
     for motor in range(len(robot.motors)):
-        for mode in ("stuck", "steady_state_error"):
+        for mode in modes:
             for n in range(faulty):
                 yield Case(mode, motor, seed + 1000 * (motor + 1) + n)
 
@@ -225,7 +234,12 @@ def simulated(
         error[:, case.motor] = _errors(time, strokes, onset, rng) * seen[case.motor]
     speed = np.gradient(command, STEP_S, axis=0)
     friction = np.asarray(settling.friction) * _direction(speed)
-    wanted = command + np.asarray(settling.bias) - friction + scatter + error
+    followed = command.copy()
+    if case.fault == LATE:
+        onset = rng.uniform(*ONSET_OF_CURVES) * duration_s
+        late_by = np.where(time < onset, 0.0, DEAD_S)
+        followed[:, case.motor] = np.interp(time - late_by, time, command[:, case.motor])
+    wanted = followed + np.asarray(settling.bias) - friction + scatter + error
     wanted = np.stack([np.interp(time - arm.delay_s, time, one) for one in wanted.T], axis=-1)
     wanted = first_order_lag(wanted.T, wanted[0], STEP_S, arm.lag_s).T
     held = np.zeros((1, len(time), motors), dtype=bool)
@@ -234,13 +248,15 @@ def simulated(
         held[0, time >= onset, case.motor] = True
     drive = Drive(wanted[None], held, compliance=arm.compliance[None])
     position = ServoEngine(robot).angles(drive, time)[0]
+    measured, read = _sensed(robot, position, time, rate, late, rng)
     name = "healthy" if case.motor < 0 else f"{robot.motor_names[case.motor]}:{case.fault}"
     return RunTable(
         run=[f"{name}/{case.seed}"],
         motor=robot.motor_names,
         time=time,
         command=command[None],
-        measured=_sensed(robot, position, time, rate, late, rng)[None],
+        measured=measured[None],
+        position=read[None],
         measured_rate_hz=rate,
         truth=Truth(
             [name], [{}], np.array([onset]), np.array([np.sqrt(np.mean(error**2)) * motors**0.5])
@@ -277,7 +293,8 @@ def _sensed(
     rate: float,
     late: float,
     rng: np.random.Generator,
-) -> FloatArray:
+) -> tuple[FloatArray, FloatArray]:
+    """Return what the tool sensor and the encoders read, (time, axis) [m], (time, motor) [rad]."""
     at = np.arange(0.0, time[-1], 1.0 / rate)
     seen = np.stack([np.interp(at - late, time, one) for one in position.T], axis=-1)
     if robot.profile.sensor_pose == "log":
@@ -287,9 +304,23 @@ def _sensed(
     else:
         points = DigitalTwin(robot).path(seen)
         points = points + rng.normal(0.0, NOISE_OF_REACH * robot.reach, points.shape)
-    measured = np.full((len(time), 3), np.nan)
-    measured[np.rint(at / STEP_S).astype(int)] = points
-    return measured
+    measured, read = np.full((len(time), 3), np.nan), np.full(position.shape, np.nan)
+    when = np.rint(at / STEP_S).astype(int)
+    measured[when], read[when] = points, seen
+    return measured, read
+
+
+def resting(motion: Path, rest_s: float) -> Path:
+    """Return a motion that stands still for its last seconds."""
+
+    def made(
+        robot: Robot, time: FloatArray, rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        command, strokes = motion(robot, time, rng)
+        last = int(np.searchsorted(time, time[-1] - rest_s))
+        return command[np.minimum(np.arange(len(time)), last)], strokes[strokes < time[last]]
+
+    return made if rest_s else motion
 
 
 def without_rests(runs: xr.Dataset, share: float | None) -> xr.Dataset:
@@ -395,7 +426,12 @@ class Judge:
         if given.folder:
             found = ft.SelfCalibratingDiagnoser(self.robot).diagnose(runs)
         else:
-            found = ft.diagnose(runs, self.robot, known, priors=priors)
+            motors = self.robot.motor_names
+            late = [Hypothesis.parse(f"{motor}:{LATE}") for motor in motors]
+            hypotheses = [*paper_hypotheses(motors), *late] if given.late else None
+            found = ft.diagnose(
+                runs, self.robot, known, hypotheses, priors=priors, sensing=given.sensing
+            )
         return found, clock.process_time() - began
 
 
@@ -404,9 +440,10 @@ def line(found: list[Diagnosis], seconds: float) -> str:
     healthy = [d for d in found if d.truth == "healthy"]
     false = sum(d.diagnosis != "healthy" for d in healthy)
     parts = [f"healthy blamed {false} of {len(healthy)}"]
-    for mode in ("stuck", "steady_state_error"):
+    for mode in (*MODES, LATE):
         some = [d for d in found if str(d.truth).endswith(mode)]
-        parts.append(f"{mode} {int(right(some).sum())} of {len(some)}")
+        if some or mode != LATE:
+            parts.append(f"{mode} {int(right(some).sum())} of {len(some)}")
     sure = sum(d.diagnosis != d.truth and max(d.posterior.values()) > 0.99 for d in found)
     parts.append(f"wrong above 99 % {sure}, {nats(found).mean():.3f} nats")
     parts.append(f"{1e3 * seconds / len(found):.0f} ms a run")
@@ -428,6 +465,9 @@ def main() -> None:
     parser.add_argument("--folder", action="store_true", help="one robot, judged together")
     parser.add_argument("--calibrated", type=int, default=0, help="from so many healthy runs")
     parser.add_argument("--told", action="store_true", help="shares and sizes as drawn")
+    parser.add_argument("--rest", type=float, default=0.0, help="last seconds that stand still")
+    parser.add_argument("--sensing", default="tool", help="what is believed")
+    parser.add_argument("--late", action="store_true", help="motors that follow late, too")
     parser.add_argument("--logs")
     parser.add_argument("--share", type=float)
     given = parser.parse_args()
@@ -438,7 +478,9 @@ def main() -> None:
     for name in given.robot:
         robot = load_robot(name)
         for motion in given.motion:
-            some = list(cases(robot, given.healthy, given.faulty, given.seed))
+            modes = (*MODES, LATE) if given.late else MODES
+            some = list(cases(robot, modes, given.healthy, given.faulty, given.seed))
+            path = resting(MOTIONS[motion], given.rest)
             one = given.folder or given.calibrated
             arm = Arm.drawn(robot, np.random.default_rng(given.seed)) if one else None
             seen = smallest_seen(robot, MOTIONS[motion], given.seed)
@@ -448,11 +490,11 @@ def main() -> None:
             sensed = given.rate, given.clock, seen, arm
             if given.watch:
                 lasts = (*sensed, given.watch)
-                streams = (simulated(robot, MOTIONS[motion], c, *lasts) for c in some)
+                streams = (simulated(robot, path, c, *lasts) for c in some)
                 alarms = [watched(robot, stream) for stream in streams]
                 print(f"{name} {motion}: {watch_line(alarms, given.watch)}", flush=True)
                 continue
-            found, seconds = Judge(robot, MOTIONS[motion], sensed, given).found(some)
+            found, seconds = Judge(robot, path, sensed, given).found(some)
             print(f"{name} {motion}: {line(found, seconds)}", flush=True)
             every += found
     if every:
