@@ -436,7 +436,7 @@ class Posterior:
         travel = self.likelihood.evidence.movements.travel(run)
         for k, motor in enumerate(model.motor_names):
             own = [i for i, h in enumerate(self.hypotheses) if _is_of(h, motor)]
-            held = [i for i in own if _is_held(self.hypotheses[i])]
+            held = [i for i in own if is_held(self.hypotheses[i])]
             moved = f"{motor.replace('_', ' ')} moved {_told_travel(model.twin.robot, k, travel)}"
             if own and untold[own].all():
                 lines.append(f"{moved}: little can be said of it")
@@ -458,8 +458,9 @@ def _is_of(hypothesis: Hypothesis, motor: str) -> bool:
     return [fault.motor for fault in hypothesis.faults] == [motor]
 
 
-def _is_held(hypothesis: Hypothesis) -> bool:
-    return all(MODES[fault.mode].signature is Signature.HELD for fault in hypothesis.faults)
+def is_held(hypothesis: Hypothesis) -> bool:
+    """Return whether a motor is held."""
+    return any(MODES[fault.mode].signature is Signature.HELD for fault in hypothesis.faults)
 
 
 def _told_travel(robot: Robot, motor: int, travel: FloatArray) -> str:

@@ -56,6 +56,17 @@ def test_a_motor_that_stops_is_named_within_three_windows(motor):
     assert answer.diagnosis.onset_s == pytest.approx(20.0, abs=6.5)  # a window
 
 
+def test_the_last_part_of_a_stream_counts_at_its_end():
+    """Its last window is five seconds long."""
+    found = monitor("armpi_fpv", "generic")
+    for sample in stream(17.0, 4, stuck_s=12.5, motor=0):
+        answer = found.update(*sample)
+    assert answer.alarm.state == CLEAR
+    answer = found.conclude()
+    assert answer.alarm.state == RAISED
+    assert answer.alarm.cause == "motor_1:stuck"
+
+
 def test_an_error_that_comes_is_named():
     answer, raised = watch(stream(60.0, 7, off_s=26.0))
     assert 26.0 < raised < 50.5

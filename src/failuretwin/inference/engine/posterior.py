@@ -14,17 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import Weighted, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.failure_behavior.mode import Signature
-from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.filter import RowsPosterior
 from failuretwin.inference.engine.moments import Moments
 from failuretwin.inference.engine.picks import Part, Picks
 from failuretwin.inference.engine.rows import Drawn
 from failuretwin.inference.engine.runs import RunsEvidence, Weighed
 from failuretwin.inference.faults.marginal import Estimate, MarginalLikelihood
+from failuretwin.inference.posterior import is_held
 
 LEAST_SHARE = 1e-4
 """Picks of a run that are less probable add nothing to what is left of theta and of sizes."""
@@ -107,7 +105,7 @@ def _size(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> 
         mean, deviation = _mean_squares(evidence, h, some)
     elif rows.amount_prior is not None:
         mean, deviation = _amounts(evidence, h, some).T
-        if _is_held(evidence.hypotheses[h]):
+        if is_held(evidence.hypotheses[h]):
             deviation = np.hypot(deviation, evidence.scene.model.count_rounding)
     else:
         return None
@@ -143,10 +141,6 @@ def _amounts(evidence: RunsEvidence, h: int, some: IntArray) -> FloatArray:
     found = told.copy()
     found[tied] = np.stack([mean, np.sqrt(left)], axis=-1)
     return found
-
-
-def _is_held(hypothesis: Hypothesis) -> bool:
-    return MODES[hypothesis.faults[0].mode].signature is Signature.HELD
 
 
 def _mean_squares(evidence: RunsEvidence, h: int, some: IntArray) -> tuple[FloatArray, FloatArray]:
