@@ -31,6 +31,7 @@ from failuretwin.inference.explanation import worded
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.observation.evidence import TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.computed_tool import is_computed
 from failuretwin.inference.observation.on_the_way import beside
 from failuretwin.inference.observation.sensors import SensorStack, parse_sensing, sensing_of
 from failuretwin.inference.posterior import (
@@ -63,7 +64,8 @@ class BayesDiagnoser:
         whole_run: Whether readings on the way count beside settled poses, where it is known how
             late this robot starts to move.
         sensing: Sensors that are believed, such as ``accelerometer`` or ``tool+encoders``; None:
-            the tool's position where runs have it, else what they have.
+            the tool's position where runs have it, else what they have. Runs of one or two motors
+            that hardly rest are judged by the motors' readings if the path is computed from these.
 
     Raises:
         InputError: If a hypothesis cannot be read or weighed, names a motor that the robot does
@@ -174,12 +176,18 @@ class BayesDiagnoser:
         Raises:
             InputError: As `diagnose` does.
         """
-        return PreparedDiagnoser(self.seen(sample), self._moving)
+        seen = self.seen(sample)
+        if self._motors_tell_more(seen):
+            seen = self._seen_by(sample, (Encoders.kind,))
+        return PreparedDiagnoser(seen, self._moving)
 
     def seen(self, runs: xr.Dataset) -> SeenRuns:
         """Return runs as this diagnoser sees them, set up as told; raises as `diagnose` does."""
         self.check(runs)
-        model = self.healthy_model.seen_by(sensing_of(runs, self.sensing))
+        return self._seen_by(runs, sensing_of(runs, self.sensing))
+
+    def _seen_by(self, runs: xr.Dataset, sensing: tuple[str, ...]) -> SeenRuns:
+        model = self.healthy_model.seen_by(sensing)
         self._check_shown(model)
         found = SeenRuns(runs, model, self.hypothesis_set, self.priors, self.whole_run)
         if found.evidence.sound.settled.movements.start.shape[1] == 0:
@@ -188,6 +196,20 @@ class BayesDiagnoser:
                 "of one movement at least."
             )
         return found
+
+    def _motors_tell_more(self, seen: SeenRuns) -> bool:
+        """Return whether runs that hardly rest are judged by the readings of the motors.
+
+        They are where fewer motors than it has axes move a tool path that is computed from them: it
+        lies on a curve without noise, and the engine, which is linear, would take what the curve
+        bends away for the sensor's. Not where the readings themselves may be wrong.
+        """
+        if self.sensing is not None or len(self.twin.robot.motors) >= seen.model.sensors.dims:
+            return False
+        if any(fault.mode in OF_ENCODERS for h in self.hypothesis_set for fault in h.faults):
+            return False
+        moving = seen.settled.on_the_way
+        return bool(2 * moving.sum() > len(moving)) and is_computed(seen.runs, self.twin)
 
     def _moving(self, seen: SeenRuns) -> TransientSamples | None:
         """Return the readings on the way that count; None: none do."""
@@ -237,7 +259,8 @@ def diagnose(
         hypotheses: What may be the case; None: the paper's nine classes.
         priors: Beliefs about onset and size; None: the usual ones.
         sensing: Sensors to believe, such as ``accelerometer`` or ``tool+encoders``; None: the
-            tool's position where runs have it, else what they have but for ``encoders``.
+            tool's position where runs have it, else what they have; ``encoders`` only as
+            `BayesDiagnoser` says.
 
     Raises:
         InputError: If something cannot be read, or does not fit together.

@@ -38,6 +38,10 @@ BEND_SPREAD = 0.5
 ODD_RATE, ODD_FACTOR = 0.1, 3.0
 """Share of robots whose offsets differ more than those of others of their kind, and how many times
 as far; assumed."""
+SOFT_FACTOR = 8.0
+"""How many times as far as usual such a robot may sag that is seen on the way, if nobody calibrated
+it: the P gain of a servo is a setting. That of an STS3215 is 32 as sold, and 4 in logs of a healthy
+one (kscalelabs/sysid)."""
 
 
 @dataclass(frozen=True)
@@ -363,6 +367,9 @@ def _covariance(model: HealthyModel, layout: Layout, factor: float) -> FloatArra
     constant, turned = model.sensors.deviations
     deviation[:3], deviation[3:6] = max(constant, KNOWN), max(turned, KNOWN)
     deviation[layout.offsets] = np.maximum(factor * offset_deviation(model), KNOWN)
+    if factor > 1.0 and layout.moving and model.imperfections.of_class:
+        sag = deviation[layout.offsets][motors : 2 * motors]
+        np.maximum(sag, SOFT_FACTOR * np.asarray(model.settling.compliance), out=sag)
     if layout.geometry:
         deviation[layout.frames] = factor * frame_deviation(model.twin.robot)
     covariance = np.diag(deviation**2)
