@@ -29,9 +29,9 @@ from failuretwin.digital_model.sensors import Encoders
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.explanation import worded
 from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.observation.computed_tool import is_computed
 from failuretwin.inference.observation.evidence import TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.observation.computed_tool import is_computed
 from failuretwin.inference.observation.on_the_way import beside
 from failuretwin.inference.observation.sensors import SensorStack, parse_sensing, sensing_of
 from failuretwin.inference.posterior import (
