@@ -82,34 +82,55 @@ def test_a_calibration_that_fits_is_found_to(armpi, work):
     assert (watch.fit.given, watch.fit.fits) == ("none", 1.0)
 
 
-def test_what_was_learned_is_what_the_robot_does(armpi, twin):
+def movements_of(armpi, learner, offsets, scatter):
+    """Settled points of a made-up robot, whose biases are those of each movement."""
+    rng, motors, before = np.random.default_rng(0), 4, np.zeros(4)
+    low, high = np.array([motor.movement_range for motor in armpi.motors]).T
+    imperfections, given = learner.model.imperfections, learner.model.settling
+    for m, bias in enumerate(offsets):
+        theta = np.zeros(19)
+        theta[7:11] = bias
+        settling = offsets_of(theta, given)
+        model = replace(
+            learner.model, imperfections=replace(imperfections, settling=settling, variation=None)
+        )
+        target = rng.uniform(low, high, motors)
+        pose = model.settle(target, np.sign(target - before), model.none_held)
+        point = model.twin.path(pose + rng.normal(0.0, scatter, motors))
+        one = SettledEvidence.empty(run=1, movement=1, motor=motors, axis=3)
+        moves = one.movements
+        moves.initial[0], moves.target[0, 0], moves.start[0, 0] = before, target, 2.0 * m
+        moves.ramp_duration[:], one.point[0, 0], one.usable[:] = 0.8, point, True
+        one.begin[:], one.end[:], one.first_reading_delay[:] = 2.0 * m + 1, 2.0 * m + 1.9, 0.05
+        yield one
+        before = target
+
+
+def test_what_was_learned_is_what_the_robot_does(armpi):
     """Biases of a made-up robot from its settled points, movement by movement."""
     known = load_calibration("generic", armpi)
     learner = LifeLearner(BayesDiagnoser(known.twin, known.imperfections, whole_run=False))
-    rng, count, motors = np.random.default_rng(0), 41, 4
-    given = learner.model.settling
-    theta = np.zeros(19)
-    theta[7:11] = true = np.array([0.004, -0.009, 0.008, -0.006])
-    settling = offsets_of(theta, given)
-    low, high = np.array([motor.movement_range for motor in armpi.motors]).T
-    target, before, changed = rng.uniform(low, high, (count, motors)), np.zeros(motors), []
-    scattered = replace(known.imperfections, settling=settling)
-    model = replace(learner.model, imperfections=scattered)
-    for m in range(count):
-        pose = model.settle(target[m], np.sign(target[m] - before), model.none_held)
-        point = twin.path(pose + rng.normal(0.0, 0.002, motors))
-        one = SettledEvidence.empty(run=1, movement=1, motor=motors, axis=3)
-        moves = one.movements
-        moves.initial[0], moves.target[0, 0], moves.start[0, 0] = before, target[m], 2.0 * m
-        moves.ramp_duration[:], one.point[0, 0], one.usable[:] = 0.8, point, True
-        one.begin[:], one.end[:], one.first_reading_delay[:] = 2.0 * m + 1, 2.0 * m + 1.9, 0.05
-        changed.append(learner.take(one, learns=True))
-        before = target[m]
+    true, count = np.array([0.004, -0.009, 0.008, -0.006]), 41
+    seen = list(movements_of(armpi, learner, np.tile(true, (count, 1)), 0.002))
+    changed = [learner.take(one, learns=True) for one in seen]
     assert [m for m, new in enumerate(changed) if new] == list(range(2 * RUN - 1, count, RUN))
     learned = learner.model
     error = np.abs(np.asarray(learned.settling.bias) - true)
     assert (error < 4.0 * np.asarray(learned.imperfections.variation.bias) + 5e-4).all()
     assert error.max() < 0.004
+
+
+def test_a_calibrated_robot_that_warms_up_is_followed(armpi):
+    """Zeros drift by two scatters within 400 movements: faster than motors wear."""
+    known = load_calibration(armpi.name, armpi)
+    diagnoser = BayesDiagnoser(known.twin, known.imperfections, whole_run=False)
+    learner = LifeLearner(diagnoser, cold=False)
+    scatter = np.asarray(known.imperfections.settling.scatter)
+    drift = 2.0 * scatter * np.linspace(0.0, 1.0, 400)[:, None]
+    for one in movements_of(armpi, learner, drift, scatter):
+        learner.take(one, learns=True)
+    moved = np.asarray(learner.life.learned.settling.bias) - known.imperfections.settling.bias
+    assert (np.abs(drift[-1] - moved) < scatter).all()
 
 
 def test_one_motor_may_scatter_as_far_as_is_usual_of_the_kind(armpi, monkeypatch):

@@ -1,5 +1,7 @@
 """What a watch learns of its robot as it goes: finished movements teach the life filter.
 
+One begins with what arms of its kind are like, another with the calibration that was given.
+
 Movements are judged before they are learned from; what is suspected of a motor in a run teaches of
 the others alone (`LifeFilter`).
 """
@@ -23,15 +25,19 @@ from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.set_ups.setup_prior import SetupPrior
 from failuretwin.inference.together.life_filter import LifeFilter
+from failuretwin.inference.together.wear_limits import WearLimits
 
 RUN = 5
 """Movements of a run that is learned from at first: as many as a run of the paper has."""
 LONG_RUN = 20
-"""The same once the robot is known a little: longer runs cost less time."""
+"""The same of a robot without calibration that is known a little: longer runs cost less time."""
 LITTLE = 100
 """Movements from which it is."""
 TIMED = 200
 """Latest movements whose commands tell how late this robot starts."""
+WARMING = WearLimits(rate=0.1, reach=4.0)
+"""How fast and how far zeros of a calibrated robot may move: by some scatters in 20 minutes, as an
+arm warms up; assumed. No fault that a watch looks for grows so."""
 
 
 class LifeMemory(Protocol):
@@ -47,22 +53,25 @@ class LifeMemory(Protocol):
 
 
 class LifeLearner:
-    """Learns of one robot from its movements, beginning with what arms of its kind are like.
+    """Learns of one robot from its movements.
 
-    The frame of the sensor is taken to be as the profile says. A run is worked on in a thread of
-    its own, so that answers need not wait; what it taught is known when the next run is complete,
-    however fast time passes. What is learned is kept by `memory`; None: it is not kept.
+    It begins with what arms of its kind are like (`cold`), or with the calibration. The frame of
+    the sensor is taken to be as the profile says. A run is worked on in a thread of its own, so
+    that answers need not wait; what it taught is known when the next run is complete, however fast
+    time passes. What is learned is kept by `memory`; None: it is not kept.
     """
 
     def __init__(
         self,
         diagnoser: BayesDiagnoser,
         memory: LifeMemory | None = None,
+        cold: bool = True,
     ) -> None:
         known = replace(diagnoser.priors, setup=SetupPrior.known())
         self._diagnoser = replace(diagnoser, priors=known)
         self._memory = memory
-        start = begin(self._diagnoser, cold=True)
+        self._cold = cold
+        start = self._start()
         self._life = start if memory is None else memory.resumed(start)
         self._waiting: list[SettledEvidence] = []
         self._told: Movements | None = None
@@ -70,6 +79,9 @@ class LifeLearner:
         self._work: Future[None] | None = None
         self.movements = self._life.movements
         self.model = as_watched(self._life) if self.movements else self._life.model
+
+    def _start(self) -> LifeFilter:
+        return begin(self._diagnoser, self._cold, None if self._cold else WARMING)
 
     @property
     def life(self) -> LifeFilter:
@@ -84,7 +96,7 @@ class LifeLearner:
         is remembered for a while.
         """
         self._waiting.append(movement)
-        run = RUN if self.movements < LITTLE else LONG_RUN
+        run = LONG_RUN if self._cold and self.movements >= LITTLE else RUN
         if len(self._waiting) < run:
             return False
         if not learns:
@@ -113,14 +125,15 @@ class LifeLearner:
         except (InputError, np.linalg.LinAlgError):
             # What was learned makes no sense. What was believed before counts on, and all begins
             # anew: a watch must not end because of what it learns.
-            self._life, self._told, self.movements = begin(self._diagnoser, cold=True), None, 0
+            self._life, self._told, self.movements = self._start(), None, 0
             return False
         return True
 
     def _follow(self, run: SettledEvidence, told: Movements) -> None:
-        life, robot = self._life, self._life.model.twin.robot
-        now = with_timing_of(life.model.imperfections, told, robot)
-        life.model = replace(life.model, imperfections=_learning(now))
+        life, known = self._life, self._life.model.imperfections
+        if self._cold:  # a calibration knows the timing from more movements
+            known = with_timing_of(known, told, life.model.twin.robot)
+        life.model = replace(life.model, imperfections=_learning(known))
         life.follow(replace(run, movements=_from_zero(run.movements)))
 
 

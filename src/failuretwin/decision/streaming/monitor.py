@@ -107,6 +107,7 @@ class FaultMonitor(RobotStream):
         ideal, cold = known.imperfections.settling is None, known.imperfections.of_class
         learns = known.sensors.tool_alone and not ideal
         self._learner = LifeLearner(diagnoser, memory) if learns else None
+        self._follower = LifeLearner(diagnoser, cold=False) if learns and not cold else None
         self._models: list[HealthyModel] = [] if cold and learns else [known]
         if self._learner is not None:
             self._models.append(self._learner.model)
@@ -126,7 +127,7 @@ class FaultMonitor(RobotStream):
         self._rested_s: float | None = None
         self._began_s = np.inf
         if len(self._models) == 1 and self._learner is not None and self._learner.movements:
-            self._adopt_learned()
+            self._adopt(-1)
 
     @property
     def set_up(self) -> str | None:
@@ -275,24 +276,25 @@ class FaultMonitor(RobotStream):
     def _learn(self, evidence: SettledEvidence, movement: int, begin_s: float) -> None:
         """Learn from a movement that is over; what is known better counts from the next on.
 
-        Nothing is learned of a robot that its calibration fits. The movements begin at `begin_s` by
-        the time of the stream [s].
+        The robot of the calibration is followed as long as it may be this one, as its zeros drift
+        and it wears; another robot is learned once it may be one. The movements begin at `begin_s`
+        by the time of the stream [s].
         """
-        if self._learner is None:
-            return
-        own = float(np.exp(self._concluded.log_weight[0, -1]))
+        share = np.exp(self._concluded.log_weight[0])
         one = evidence[:, movement : movement + 1]
         told = evidence.movements.since(movement)[:, :1]
         told = replace(told, start=told.start + begin_s)
-        if self._learner.take(replace(one, movements=told), learns=own > WORTH_LEARNING):
-            self._models[-1] = rounded(self._learner.model, self._fleet.rounding, None)
-            if own > 0.5:
-                self._adopt_learned()
+        one = replace(one, movements=told)
+        for at, learner in ((0, self._follower), (-1, self._learner)):
+            if learner is not None and learner.take(one, learns=share[at] > WORTH_LEARNING):
+                self._models[at] = rounded(learner.model, self._fleet.rounding, None)
+                if share[at] > 0.5:
+                    self._adopt(at)
 
-    def _adopt_learned(self) -> None:
-        """Estimate by what the robot itself has taught."""
-        self._fleet.adopt(self._models[-1].imperfections)
-        self._models[-1] = self._fleet.model
+    def _adopt(self, at: int) -> None:
+        """Estimate by one of the models, which the robot itself has taught."""
+        self._fleet.adopt(self._models[at].imperfections)
+        self._models[at] = self._fleet.model
 
 
 def candidates(known: HealthyModel) -> list[HealthyModel]:
