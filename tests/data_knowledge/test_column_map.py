@@ -176,6 +176,11 @@ def spoilt(change):
     [
         (lambda t: t.pop("c"), "unknown column 'c'"),
         (lambda t: t.__setitem__("b", ["x", *t["b"][1:]]), "line 2, column b: got 'x'"),
+        (
+            lambda t: t.__setitem__("x", [np.inf, *t["x"][1:]]),
+            r"line 2, column x: got 'inf', expected a finite number\. Leave the cell empty where "
+            r"there is no value\.$",
+        ),
         (lambda t: t.__setitem__("t", t["t"].to_numpy()[::-1]), "time runs backwards"),
         (lambda t: t.__setitem__("t", [*t["t"][:10], *(t["t"][10:] + 900)]), "clock jumps by 900"),
         (lambda t: t.__setitem__("x", np.nan), "no reading of the tool"),

@@ -112,16 +112,29 @@ class Table:
         self.check(columns)
         part, values = self.cells[list(columns)], self.values(columns)
         wrong = ~np.isfinite(values)
-        hint = ""
         if gaps:
             wrong &= part.notna().to_numpy()
             wrong &= ~part.apply(lambda c: c.str.strip().str.lower().isin(["nan", ""])).to_numpy()
-            hint = ' For decimal commas add decimal = "," at the top of the map.'
         if wrong.any():
             row, column = np.argwhere(wrong)[0]
-            line = int(part.index[row]) + 2
+            line, expected = int(part.index[row]) + 2, _expected(float(values[row, column]), gaps)
             raise InputError(
                 f"{self.path}: line {line}, column {columns[column]}: got "
-                f"{part.iloc[row, column]!r}, expected a number.{hint}"
+                f"{part.iloc[row, column]!r}, expected {expected}"
             )
         return values
+
+
+def _expected(value: float, gaps: bool) -> str:
+    """Return what is expected in place of a cell that holds no finite value, and how to get it.
+
+    Args:
+        value: The cell as a number; NaN: it is none.
+        gaps: Whether a cell may be empty.
+    """
+    if np.isinf(value):
+        mend = " Leave the cell empty where there is no value." if gaps else ""
+        return f"a finite number.{mend}"
+    if not gaps:
+        return "a number."
+    return 'a number. For decimal commas add decimal = "," at the top of the map.'
