@@ -38,10 +38,10 @@ BEND_SPREAD = 0.5
 ODD_RATE, ODD_FACTOR = 0.1, 3.0
 """Share of robots whose offsets differ more than those of others of their kind, and how many times
 as far; assumed."""
-SOFT_FACTOR = 8.0
-"""How many times as far as usual such a robot may sag that is seen on the way, if nobody calibrated
-it: the P gain of a servo is a setting. That of an STS3215 is 32 as sold, and 4 in logs of a healthy
-one (kscalelabs/sysid)."""
+SOFT_RATE, SOFT_FACTOR = 0.1, 8.0
+"""Share of odd robots, seen on the way and calibrated by nobody, that may sag further, and how many
+times as far as usual ones: the P gain of a servo is a setting. That of an STS3215 is 32 as sold,
+and 4 in logs of a healthy one (kscalelabs/sysid)."""
 
 
 @dataclass(frozen=True)
@@ -335,8 +335,10 @@ def robot_components(model: HealthyModel, layout: Layout, factors: ScaleFactors)
         factors: What is unknown of its scatter, of the noise of its sensor and of its starts.
     """
     doubted = bool(np.any(offset_deviation(model)))
-    factors_of = (1.0, ODD_FACTOR) if doubted else (1.0,)
-    rate = ODD_RATE if doubted else 0.0
+    odd = [(ODD_RATE, _covariance(model, layout, ODD_FACTOR))] if doubted else []
+    if doubted and layout.moving and model.imperfections.of_class:
+        odd.append((SOFT_RATE, _soft(model, layout, odd[0][1])))
+    rate = sum(share for share, _ in odd)
     starts = (factors.jitter if layout.moving else AS_TOLD.jitter).items()
     sensors = [((tau, kappa), a * b) for tau, a in starts for kappa, b in factors.noise.items()]
     found = [
@@ -344,11 +346,11 @@ def robot_components(model: HealthyModel, layout: Layout, factors: ScaleFactors)
         for sigma, a in factors.scatter.items()
         for others, b in sensors
     ]
-    if doubted:
-        found += [(b * rate, 1, 1.0, *others) for others, b in sensors]
+    for at, (share, _) in enumerate(odd, start=1):
+        found += [(b * share, at, 1.0, *others) for others, b in sensors]
     found.sort(key=lambda one: -one[0])
     weight, normal, sigma, tau, kappa = zip(*found, strict=True)
-    covariance = np.stack([_covariance(model, layout, factor) for factor in factors_of])
+    covariance = np.stack([_covariance(model, layout, 1.0), *(one for _, one in odd)])
     return Components(
         np.log(weight),
         np.array(normal),
@@ -367,9 +369,6 @@ def _covariance(model: HealthyModel, layout: Layout, factor: float) -> FloatArra
     constant, turned = model.sensors.deviations
     deviation[:3], deviation[3:6] = max(constant, KNOWN), max(turned, KNOWN)
     deviation[layout.offsets] = np.maximum(factor * offset_deviation(model), KNOWN)
-    if factor > 1.0 and layout.moving and model.imperfections.of_class:
-        sag = deviation[layout.offsets][motors : 2 * motors]
-        np.maximum(sag, SOFT_FACTOR * np.asarray(model.settling.compliance), out=sag)
     if layout.geometry:
         deviation[layout.frames] = factor * frame_deviation(model.twin.robot)
     covariance = np.diag(deviation**2)
@@ -378,6 +377,15 @@ def _covariance(model: HealthyModel, layout: Layout, factor: float) -> FloatArra
         covariance[layout.lags, layout.lags] = common**2 + own**2 * np.eye(motors)
         covariance[layout.bend, layout.bend] = BEND_SPREAD**2
     return covariance
+
+
+def _soft(model: HealthyModel, layout: Layout, odd: FloatArray) -> FloatArray:
+    """Return the covariance of an odd robot whose motors may give way much further."""
+    found, places = odd.copy(), np.arange(layout.offsets.start, layout.offsets.stop)
+    sag = places[layout.motors : 2 * layout.motors]
+    soft = (SOFT_FACTOR * np.asarray(model.settling.compliance)) ** 2
+    found[sag, sag] = np.maximum(found[sag, sag], soft)
+    return found
 
 
 def frame_deviation(robot: Robot) -> FloatArray:
