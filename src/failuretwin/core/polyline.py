@@ -23,6 +23,9 @@ TURN_RAD = 1e-5
 REST_S = 0.3
 """Shortest rest of all motors in a reference guided by hand [s]: twice the 0.15 s by which such an
 arm lags, so that the arm is measured at rest too."""
+LONGEST_CORNER_S = 0.6
+"""Longest time between two samples in which a corner is looked for [s]: commands that come at 1 Hz
+are the corners themselves."""
 STAIR_QUANTA = 4.0
 """Largest step of a staircase, in quanta; a larger step is a ramp or a jump."""
 SAME = 1e-9
@@ -144,13 +147,14 @@ def _sharpen(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return times and values of the corners `kept`, and which of them belong to rests.
 
-    A corner between two samples lies where their lines meet; `fixed` marks starts and ends of
-    rests.
+    A corner between two samples lies where their lines meet, unless these are far apart in time;
+    `fixed` marks starts and ends of rests.
     """
     corners = [(float(time[i]), float(value[i])) for i in kept]
     sharp, rests, i = corners[:1], [bool(fixed[kept[0]])], 1
     while i < len(corners):
         between = i + 2 < len(corners) and kept[i + 1] - kept[i] == 1
+        between = between and corners[i + 1][0] - corners[i][0] <= LONGEST_CORNER_S
         met = _meet(sharp[-1], corners[i], corners[i + 1], corners[i + 2]) if between else None
         sharp.append(met or corners[i])
         rests.append(bool(fixed[kept[i]] or (met is not None and fixed[kept[i + 1]])))

@@ -25,7 +25,11 @@ from failuretwin.inference.misfit import FITS, run_misfit
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.observation.on_the_way import likeliest_lag, on_the_way
+from failuretwin.inference.observation.on_the_way import (
+    likeliest_lag,
+    on_the_way,
+    told_too_seldom,
+)
 from failuretwin.inference.observation.rounding import (
     Rounding,
     command_rounding,
@@ -202,6 +206,8 @@ class SeenRuns:
 
     def clock(self) -> SetUp | None:
         """Return by how much the clocks are apart; None where that is not sure."""
+        if told_too_seldom(self.evidence.sound, self.model, self.lag_s).all():
+            return None
         found = clock_posterior(self.evidence.sound, self.model)
         if found.apart < SURE:
             return None

@@ -1,9 +1,12 @@
 """Whether the tool leaves the straight way between two commands: a log then tells too few of them.
 
 A command once a second, joined by lines, is not the curve that an arm follows. Its tool is near the
-lines at the commands and far off between. Errors and stuck motors are off at the commands too:
+lines at their corners and far off between. Errors and stuck motors are off at the corners too:
 
-    strays = median over stretches of  |off at mid| / max |off at either end|  >  1.4
+    strays in a stretch from corner to corner:  |off at mid| / max |off at either end|  >  1.4
+
+A motor that is stuck hides this from then on. Where commands come at a steady rate, it is told by a
+quarter of the stretches, else by half of them.
 
 Section: docs/inference.md#moments
 """
@@ -20,14 +23,24 @@ from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.lag_offset import command_at
 
 STRAYS = 1.4
-"""Median factor by which the tool is further off between commands than at them: 1.2 at most in
-simulated arms that move straight, 1.7 to 7 where a curve is told once a second."""
+"""Factor by which the tool is further off between corners than at them."""
+SEEN = 2.0
+"""How far off a tool is at least between corners, in deviations of a healthy arm at rest."""
+SHARE, SHARE_STEADY = 0.5, 0.25
+"""Share of the stretches in which it is so, and where commands come at a steady rate. Simulated
+curves told once a second: 0.4 to 0.9, 0.1 to 0.5 with a stuck motor. Arms that move straight: 0;
+0.4 at most with a motor that sticks now and then."""
+STEADY = 0.2
+"""Largest deviation of a steady stretch from the median, as a share of it."""
 ENDS, MIDDLE = 0.15, 0.35
-"""Readings count as at a command within this share of a stretch, between two from that share on."""
+"""Readings count as at a corner within this share of a stretch, between two from that share on."""
 FEWEST = 4
 """Stretches from which that is told."""
-SEEN = 2.0
-"""How far off a tool is at least between commands, in deviations of a healthy arm at rest."""
+LEAST_S = 0.7
+"""Shortest stretch that counts [s]: lines between closer commands are near enough to a curve."""
+CORNER_RAD_S, SAME_CORNER_S = 1e-3, 0.05
+"""A command turns a corner where its speed changes by more [rad/s]; corners this near are one
+[s]."""
 
 
 def strays_between(
@@ -43,34 +56,50 @@ def strays_between(
     """
     found: BoolArray = np.zeros(len(runs), dtype=bool)
     for run in np.flatnonzero(runs).tolist():
-        middle, ends, deviation = _off(evidence, model, run, lag_s)
+        command, time = (as_floats(evidence.runs[n].values) for n in ("command", "time"))
+        corners = _corners(command[run], time)
+        middle, ends, deviation = _off(evidence, model, run, lag_s, corners)
         if len(middle) >= FEWEST:
-            found[run] = np.median(middle / np.maximum(ends, 1e-9)) > STRAYS
-            found[run] &= np.median(middle / deviation) > SEEN
+            strays = (middle > STRAYS * ends) & (middle > SEEN * deviation)
+            found[run] = strays.mean() >= (SHARE_STEADY if _steady(corners) else SHARE)
     return found
 
 
 def _off(
-    evidence: Evidence, model: HealthyModel, run: int, lag_s: float
+    evidence: Evidence, model: HealthyModel, run: int, lag_s: float, corners: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return how far the tool is off in the middle of each stretch, and at its worse end.
 
     Returns:
         Both, and the deviation of a healthy arm there, (stretch,) [m].
     """
-    movements, seen = evidence.settled.movements, np.flatnonzero(evidence.read[run])
+    seen = np.flatnonzero(evidence.read[run])
     when = as_floats(evidence.runs["time"].values)[seen] - lag_s
     expected, jacobian = model.sensors.expected(command_at(evidence, run, when))
     off = np.linalg.norm(evidence.readings.point[run][seen] - expected, axis=-1)
     spread = np.sum((jacobian * model.scatter) ** 2, axis=(-2, -1)) + 3.0 * model.path_noise**2
-    starts, rows = np.sort(movements.start[run][movements.exists[run]]), list[list[float]]()
-    for begin, end in pairwise(starts.tolist()):
+    rows = list[list[float]]()
+    for begin, end in pairwise(corners.tolist()):
         share = (when - begin) / (end - begin)
         first, last = np.abs(share) < ENDS, np.abs(share - 1.0) < ENDS
         middle = np.abs(share - 0.5) < 0.5 - MIDDLE
-        if first.any() and last.any() and middle.any():
+        if end - begin >= LEAST_S and first.any() and last.any() and middle.any():
             worse = max(np.median(off[first]), np.median(off[last]))
             deviation = np.sqrt(np.median(spread[middle]))
             rows.append([float(np.median(off[middle])), float(worse), float(deviation)])
     middles, ends, deviations = np.array(rows).reshape(-1, 3).T
     return middles, ends, deviations
+
+
+def _corners(command: FloatArray, time: FloatArray) -> FloatArray:
+    """Return when any motor's command (time, motor) turns a corner, and its ends, (corner,) [s]."""
+    speed = np.diff(command, axis=0) / np.diff(time)[:, None]
+    turns = np.abs(np.diff(speed, axis=0)).max(axis=1) > CORNER_RAD_S
+    corners = np.concatenate([time[:1], time[1:-1][turns], time[-1:]])
+    return corners[np.diff(corners, prepend=-np.inf) > SAME_CORNER_S]
+
+
+def _steady(corners: FloatArray) -> bool:
+    """Return whether nearly all stretches between corners last equally long."""
+    low, middle, high = np.quantile(np.diff(corners), [0.1, 0.5, 0.9])
+    return bool(max(high - middle, middle - low) <= STEADY * middle)

@@ -115,6 +115,11 @@ def long_curves(evidence: Evidence) -> BoolArray:
     return found
 
 
+def told_too_seldom(evidence: Evidence, model: HealthyModel, lag_s: float) -> BoolArray:
+    """Return which runs hardly rest, and have commands too far apart to tell the way, (run,)."""
+    return strays_between(evidence, model, hardly_rest(evidence, model), lag_s)
+
+
 def likeliest_lag(evidence: Evidence, model: HealthyModel) -> float:
     """Return how far the runs that hardly rest trail their commands [s]; they share a set-up."""
     some = np.flatnonzero(hardly_rest(evidence, model))
@@ -132,8 +137,7 @@ def on_the_way(evidence: Evidence, model: HealthyModel, lag_s: float) -> Settled
         lag_s: How far the tool trails its commands [s], as `likeliest_lag` returns it.
     """
     settled = evidence.settled
-    hardly = hardly_rest(evidence, model)
-    hardly &= ~strays_between(evidence, model, hardly, lag_s)
+    hardly = hardly_rest(evidence, model) & ~told_too_seldom(evidence, model, lag_s)
     unseen = settled.movements.exists & ~settled.usable & _few_rests(evidence, model)[:, None]
     unseen = (unseen | long_curves(evidence)) & hardly[:, None]
     if not unseen.any():
