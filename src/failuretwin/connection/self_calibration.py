@@ -265,6 +265,7 @@ def as_calibration(
         used_readings=False,
         remarks=tuple(_remarks(parameters, found, runs)),
         frame=_frame(found),
+        moments=sum(p.likelihood.evidence.moments_on_the_way for p in found.posteriors),
     )
 
 

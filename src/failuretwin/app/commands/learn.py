@@ -102,15 +102,17 @@ def calibrate(
 def _wrong_set_up(runs: xr.Dataset, robot: ft.Robot) -> str:
     """Return the misfit between logs and profile, which a calibration would learn as the robot.
 
-    Small zeros are no misfit: a calibration learns them.
+    Small zeros, scatter and noise are no misfit: a calibration learns them.
     """
     from failuretwin.inference.seen_runs import set_up_remark
+    from failuretwin.inference.set_ups.wrong_setup import ELSEWHERE
 
     seen = ft.BayesDiagnoser(robot).seen(runs)
     set_ups = seen.set_ups()
     remark = "" if set_ups.best.set_up.kind == "zero" else set_up_remark(set_ups)
     if set_ups.fits and not remark:
-        remark = seen.elsewhere()
+        place = seen.elsewhere()
+        remark = place if ELSEWHERE in place else ""
     said = "; ".join(filter(None, (remark, *seen.rounding())))
     if not said:
         return ""

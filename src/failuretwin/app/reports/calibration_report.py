@@ -94,7 +94,7 @@ def calibration_parts(found: Calibration, robot: Robot) -> list[Part]:
     """Return all learned parameters and their accuracy on unseen sessions."""
     way = "motor readings" if found.used_readings else "the tool path alone"
     parts: list[Part] = [
-        f"{robot.name}: {found.movements} settled movements of {found.runs} runs, {way}\n",
+        f"{robot.name}: {found.extent}, {way}\n",
         parameter_table(found.parameters, robot),
         *(f"  {remark}" for remark in found.remarks),
     ]

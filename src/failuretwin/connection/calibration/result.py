@@ -10,7 +10,7 @@ import numpy as np
 
 from failuretwin import __version__
 from failuretwin.core.config import read_toml
-from failuretwin.core.errors import InputError, OutputError
+from failuretwin.core.errors import InputError, OutputError, counted
 from failuretwin.data_knowledge.store import check_writable, write_text
 from failuretwin.digital_model.calibrated_robot import (
     CALIBRATION_TABLE,
@@ -141,7 +141,7 @@ class Calibration:
         parameters: Every figure with its 95 % interval.
         sessions: Names of the sessions it was fitted to.
         runs: Number of runs.
-        movements: Number of settled movements that count.
+        movements: Number of settled movements that count, and of moments on the way.
         used_readings: Whether the motors' own readings were used, or the tool path alone.
         left_out: What was left out.
         held_out: How well it predicts sessions that it has not seen.
@@ -149,6 +149,7 @@ class Calibration:
         loops: Servo loops from step tests; motors without any keep those of the profile. Timing is
             what is left on top of them.
         frame: Where the tool sensor stands beside what the profile says; None: as that says.
+        moments: Of the movements, those that are moments on the way of an arm that hardly rests.
     """
 
     imperfections: Imperfections
@@ -162,6 +163,17 @@ class Calibration:
     remarks: tuple[str, ...] = ()
     loops: tuple[CalibratedLoop, ...] = ()
     frame: SensorFrame | None = None
+    moments: int = 0
+
+    @property
+    def extent(self) -> str:
+        """From how many movements, moments on the way and runs it was learned, in words."""
+        rests, seen = self.movements - self.moments, list[str]()
+        if rests or not self.moments:
+            seen.append(counted(rests, "settled movement"))
+        if self.moments:
+            seen.append(f"{counted(self.moments, 'moment')} on the way")
+        return f"{' and '.join(seen)} of {counted(self.runs, 'run')}"
 
     def applied_to(self, robot: Robot) -> CalibratedRobot:
         """Return a robot with these loops, frame and imperfections, as from the file of this.

@@ -1,0 +1,47 @@
+"""What a calibration says it was learned from, and what its command warns of."""
+
+from dataclasses import replace
+
+import pytest
+
+import failuretwin as ft
+from failuretwin.app.commands.learn import _wrong_set_up
+from failuretwin.app.reports.calibration_report import calibration_parts
+from failuretwin.core.hypothesis import HEALTHY
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import Schedule
+from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.inference.seen_runs import SeenRuns
+from failuretwin.inference.set_ups.wrong_setup import ELSEWHERE
+
+ENDLESS = RandomMovements(count=6, period_s=1.2, ramp_shares=(1.0,))
+LABELS = ["fault", "fault_detail", "onset", "magnitude", "position"]
+
+
+def healthy_runs(robot, like, movements=None):
+    """Four runs of a healthy robot; movements that are given follow each other without a rest."""
+    own = replace(like, lost_commands=())
+    own = own if movements is None else replace(own, schedule=Schedule(period_s=(1.2, 1.2)))
+    plan = Plan(robot, [HEALTHY], 4, seed=5, imperfections=own, movements=movements)
+    return simulate(plan).drop_vars(LABELS, errors="ignore")
+
+
+def test_a_calibration_of_an_arm_that_never_rests_counts_moments(armpi, measured_armpi):
+    found = ft.calibrate(healthy_runs(armpi, measured_armpi, ENDLESS), armpi)
+    head = str(calibration_parts(found, armpi)[0])
+    assert f"{found.movements} moments on the way of 4 runs" in head
+    assert "settled" not in head
+    assert (
+        replace(found, movements=3, moments=1).extent
+        == "2 settled movements and 1 moment on the way of 4 runs"
+    )
+
+
+@pytest.mark.parametrize("place", ["", f"{ELSEWHERE} (99.0%)"])
+def test_scatter_is_no_wrong_set_up_for_a_calibration(armpi, measured_armpi, monkeypatch, place):
+    """A calibration learns it; only a sensor that stands elsewhere is warned of."""
+    scatter = "the motors seem to scatter about 2.5 times as much as when they were calibrated"
+    told = "; ".join(filter(None, (place, scatter)))
+    monkeypatch.setattr(SeenRuns, "elsewhere", lambda _: told)
+    said = _wrong_set_up(healthy_runs(armpi, measured_armpi), armpi)
+    assert ("failuretwin doctor" in said) == bool(place)
