@@ -5,6 +5,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import failuretwin as ft
+from failuretwin.app.reports.isolability_report import isolability_summary
 from failuretwin.digital_model.robot import load_robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.set_up_weighing import SetUpWeighing
@@ -22,23 +23,35 @@ def curve(seconds):
     return CubicSpline(at, points)(time)
 
 
+def logged(folder, followed, command, every_s):
+    """A log of a tool at 25 Hz whose command (time, motor) is told so seldom."""
+    time, tool = STEP_S * np.arange(len(followed)), DigitalTwin(ROBOT).path(followed)
+    rows = [",".join(["time_s", *(f"command_{n}_rad" for n in ROBOT.motor_names), *TOOL])]
+    for i in range(0, len(time), 4):
+        is_told = i % round(every_s / STEP_S) == 0
+        told = [f"{q:.6f}" for q in command[i]] if is_told else [""] * command.shape[1]
+        rows.append(",".join([f"{time[i]:.3f}", *told, *(f"{x:.6f}" for x in tool[i])]))
+    (folder / "log.csv").write_text("\n".join(rows))
+    return ft.read_runs(folder / "log.csv", ROBOT)
+
+
 @pytest.mark.parametrize("fault", ["healthy", "stuck", "off"])
 def test_curves_told_once_a_second_are_undecided_without_a_search(fault, tmp_path, monkeypatch):
     """Also those of a log: its commands are the corners, and nothing else is looked for."""
-    followed, half = curve(12.0), 600
+    command, half = curve(12.0), 600
+    followed = command.copy()
     if fault != "healthy":
         followed[half:, 1] = followed[half, 1] if fault == "stuck" else followed[half:, 1] + 0.12
-    time, tool = STEP_S * np.arange(len(followed)), DigitalTwin(ROBOT).path(followed)
-    command = curve(12.0)
-    rows = [",".join(["time_s", *(f"command_{n}_rad" for n in ROBOT.motor_names), *TOOL])]
-    for i in range(0, len(time), 4):
-        told = [f"{q:.6f}" for q in command[i]] if i % 100 == 0 else [""] * command.shape[1]
-        rows.append(",".join([f"{time[i]:.3f}", *told, *(f"{x:.6f}" for x in tool[i])]))
-    (tmp_path / "log.csv").write_text("\n".join(rows))
-    runs = ft.read_runs(tmp_path / "log.csv", ROBOT)
-    at = np.arange(0, len(time) - 100, 100)
+    runs, at = logged(tmp_path, followed, command, 1.0), np.arange(0, len(command) - 100, 100)
     np.testing.assert_allclose(runs["command"].values[0, at], command[at], atol=3e-3)
     monkeypatch.setattr(SetUpWeighing, "searched", None)
     (found,) = ft.diagnose(runs, ROBOT, "generic")
     assert found.diagnosis is None
     assert "commands too far apart" in found.verdict
+    assert isolability_summary(runs, ft.BayesDiagnoser(ROBOT, "generic")) == []
+
+
+def test_for_curves_the_command_is_named_that_works_out_what_they_tell_apart(tmp_path):
+    runs = logged(tmp_path, curve(12.0), curve(12.0), 0.04)
+    (line,) = isolability_summary(runs, ft.BayesDiagnoser(ROBOT, "generic"))
+    assert "`failuretwin isolability --motions LOG`" in line

@@ -138,6 +138,10 @@ MAX_MOTIONS = 3
 """Number of motions that are examined, spread evenly over the runs."""
 MAX_COMPARED = 16
 """Maximum number of hypotheses; comparing more takes longer than the diagnosis."""
+WITHOUT_RESTS = (
+    "which faults motions without rests tell apart takes longer to work out than the diagnosis: "
+    "run `failuretwin isolability --motions LOG`"
+)
 
 
 def isolability_summary(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str]:
@@ -157,8 +161,11 @@ def isolability_summary(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str
     command = as_floats(runs["command"].values)
     moving = np.flatnonzero(np.ptp(command, axis=1).any(axis=1))
     some = moving[np.unique(np.linspace(0, len(moving) - 1, MAX_MOTIONS).astype(int))]
-    if diagnoser.seen(runs.isel(run=some)).settled.on_the_way.all():
-        return ["which faults motions without rests tell apart is not worked out", *left_out]
+    settled = diagnoser.seen(runs.isel(run=some)).settled
+    if not settled.usable.any():
+        return left_out
+    if settled.on_the_way.all():
+        return [WITHOUT_RESTS, *left_out]
     found = isolability(
         diagnoser.twin,
         command[some],
