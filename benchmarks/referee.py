@@ -60,7 +60,7 @@ def likeliest(evidence: RunsEvidence, h: int, run: int) -> tuple[Part, RowsPoste
     mine = np.flatnonzero((one.picks.run == run) & (one.picks.component == 0))
     row = int(one.picks.row[mine[one.log_evidence[mine].argmax()]])
     picks = Picks(np.array([run]), np.array([row]), np.array([0]))
-    part = Part(evidence.scene, rows, picks, components, prepared(rows, components))
+    part = Part(evidence.scene, rows, picks, components, prepared(evidence.scene, rows, components))
     return part, part.refined(part.filtered())
 
 

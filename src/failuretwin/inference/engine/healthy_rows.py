@@ -16,10 +16,10 @@ from dataclasses import replace
 import numpy as np
 
 from failuretwin.core.numerics import log_of
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.settling import loads_in_range
 from failuretwin.inference.engine.outcomes import Outcomes
-from failuretwin.inference.engine.rows import Rows, Scene
+from failuretwin.inference.engine.rows import Rows, Scene, arrived
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.registered import REGISTRATION
 
@@ -37,7 +37,8 @@ def healthy_rows(scene: Scene) -> Rows:
         scene.healthy.with_rows(),
         weight,
         np.arange(weight.shape[-1]),
-        scene.columns[:, None],
+        scene.columns[:, None, :, 0],
+        scene.columns_of,
         np.zeros((runs, 1, count, channels)),
         np.zeros((runs, 1)),
         np.zeros((runs, 1)),
@@ -122,10 +123,15 @@ def _with_loads(
     outcomes = usual.outcomes
     residual = outcomes.residual - np.where(there, mass * lever[:, None], 0.0)
     others = (np.broadcast_to(x, (len(x), rows, *x.shape[2:])) for x in outcomes.arrays[1:])
-    columns = np.repeat(usual.columns, rows, axis=1)
     motors = scene.layout.motors
     places = slice(REGISTRATION + motors, REGISTRATION + 2 * motors)
-    columns[..., places] += np.where(there[..., None], mass * by_kg[:, None], 0.0)
+
+    def columns_of(run: IntArray, row: IntArray, moment: IntArray, outcome: IntArray) -> FloatArray:
+        columns = scene.columns_of(run, row, moment, outcome)
+        more = mass * by_kg[run, moment, outcome]
+        columns[..., places] += np.where(loaded[row, moment, None, None], more, 0.0)
+        return columns
+
     weight = usual.log_weight
     return replace(
         usual,
@@ -133,7 +139,8 @@ def _with_loads(
         first=np.full(rows, scene.moments.count),
         outcomes=Outcomes(residual, *others),
         log_weight=np.broadcast_to(weight, (len(weight), rows, *weight.shape[2:])),
-        columns=columns,
+        columns=arrived(columns_of, rows, scene.moments),
+        columns_of=columns_of,
         lever=np.where(there[..., 0], lever[:, None, :, 0], 0.0),
         centre=np.broadcast_to(np.where(np.arange(rows) > 0, mass, 0.0), log_prior.shape),
         variance=np.broadcast_to(np.where(np.arange(rows) > 0, mass**2, 0.0), log_prior.shape),

@@ -20,8 +20,16 @@ from failuretwin.core.compiled import compiled
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.engine.integral import Noise, invert, log_density
 from failuretwin.inference.engine.outcomes import Outcomes
-from failuretwin.inference.engine.rows import AmountPrior, Onsets, Rows, Scene, before_onset
-from failuretwin.inference.engine.theta import Motion, columns
+from failuretwin.inference.engine.rows import (
+    AmountPrior,
+    ColumnsOf,
+    Onsets,
+    Rows,
+    Scene,
+    arrived,
+    before_onset,
+)
+from failuretwin.inference.engine.theta import Motion, Shown, columns
 
 Angle = Callable[[FloatArray, IntArray], FloatArray]
 """Angle of the motor at some amounts under outcomes of the commands,
@@ -205,12 +213,7 @@ class MovedMotor:
         shown = scene.model.sensors.expected(pose)
         value, jacobian, *beside = (np.swapaxes(x, 1, 2) for x in (*shown, late, bent))
         outcomes = Outcomes.of_poses(moments, (value, jacobian), self.variance, *beside)
-        G = columns(scene.model, pose, shown, Motion(direction, speed, bend), scene.layout)
-        if self.held:
-            own = scene.layout.own(motor)
-            G[..., own] = 0.0
-            if tie is not None:
-                G[..., own] = shown[1][..., motor, None] * tie[:, :, None, None, None, own]
+        columns_of = self._columns_of(pose, shown, Motion(direction, speed, bend), tie)
         weight = np.broadcast_to(moments.log_weight[:, None], pose.shape[:-1])
         rows = Rows(
             log_prior,
@@ -218,15 +221,46 @@ class MovedMotor:
             outcomes.rows_first(),
             weight,
             np.arange(weight.shape[-1]),
-            G,
+            arrived(columns_of, x.shape[1], moments),
+            columns_of,
             shown[1][:, :, :, 0, :, motor] * self.slope(x, ARRIVED)[..., None],
             x,
             variance,
             amount_prior,
             onsets=onsets,
             tie=tie,
+            own=scene.layout.own(motor) if self.held else (),
         )
-        return before_onset(rows, scene.healthy, scene.columns)
+        return before_onset(rows, scene.healthy)
+
+    def _columns_of(
+        self, pose: FloatArray, shown: Shown, motion: Motion, tie: FloatArray | None
+    ) -> ColumnsOf:
+        """Return G by run, row, moment and outcome; before the onset that of a healthy robot.
+
+        Args:
+            pose: Settled angles, (run, row, moment, outcome, motor) [rad].
+            shown: What the sensors show there.
+            motion: How the motors move there.
+            tie: As of `rows`.
+        """
+        scene, own = self.scene, self.scene.layout.own(self.motor)
+
+        def of(run: IntArray, row: IntArray, moment: IntArray, outcome: IntArray) -> FloatArray:
+            found = scene.columns_of(run, row, moment, outcome)
+            after = moment >= self.first[row]
+            at = tuple(index[after] for index in (run, row, moment, outcome))
+            seen = shown[0][at], shown[1][at]
+            moves = Motion(motion.direction[at], motion.speed[at], motion.bend[at])
+            G = columns(scene.model, pose[at], seen, moves, scene.layout)
+            if self.held:
+                G[..., own] = 0.0
+            if tie is not None:
+                G[..., own] = seen[1][..., self.motor, None] * tie[at[:2]][:, None, own]
+            found[after] = G
+            return found
+
+        return of
 
 
 def _middle_of_best(says: FloatArray) -> IntArray:

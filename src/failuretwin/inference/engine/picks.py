@@ -72,10 +72,13 @@ class Prepared:
     kept: IntArray | None
 
 
-def prepared(rows: Rows, components: Components) -> Prepared:
+def prepared(scene: Scene, rows: Rows, components: Components) -> Prepared:
     """Return all rows of a hypothesis with all outcomes, by the first component.
 
+    How columns differ from outcome to outcome is that of a healthy robot here.
+
     Args:
+        scene: The runs.
         rows: Rows of the hypothesis.
         components: What is believed of the robot.
     """
@@ -84,61 +87,84 @@ def prepared(rows: Rows, components: Components) -> Prepared:
     assert rows.columns.shape[1] == own, "rows share outcomes and columns, or neither"
     every = np.arange(runs * count).reshape(runs, count)
     place = every if own == count else np.repeat(np.arange(runs)[:, None], count, axis=1)
-    run = np.repeat(np.arange(runs), own)
 
     def flat(array: FloatArray) -> FloatArray:
         return array.reshape(runs * own, *array.shape[2:])
 
-    outcomes = Outcomes(*(flat(x) for x in rows.outcomes.arrays))
-    log_weight = rows.log_weight.reshape(runs * count, *rows.log_weight.shape[2:])
-    first = int(components.normal[0])
-    tables = _tables(outcomes, log_weight, flat(rows.columns), rows.usual, components, run, [first])
-    return Prepared(tables, place, every, flat(rows.columns)[:, :, 0], None)
+    first, run = int(components.normal[0]), np.arange(runs)
+    shift, spread = apart(scene.columns, components, run, first)
+    shift, spread = shift[:, None], spread[:, None]
+    if rows.own:
+        after = (np.arange(shift.shape[2]) >= rows.first[:, None])[None, :, :, None, None]
+        others = apart(scene.columns, components, run, first, rows.own)
+        shift, spread = (
+            np.where(after.reshape(*after.shape, *(1,) * (x.ndim - 5)), y[:, None], x)
+            for x, y in zip((shift, spread), others, strict=True)
+        )
+    outcomes, G = rows.outcomes, flat(rows.columns)
+    residual = flat(outcomes.residual - shift[:, :, :, rows.usual])
+    extra = flat(outcomes.beside + spread[:, :, :, rows.usual])
+    mean, covariance = _of_f(G, components, np.repeat(run, own), first)
+    tables = (
+        residual[None],
+        flat(outcomes.scatter),
+        flat(outcomes.late),
+        extra[None],
+        rows.log_weight.reshape(runs * count, *rows.log_weight.shape[2:]),
+        mean[None],
+        covariance[None],
+    )
+    return Prepared(_contiguous(tables), place, every, G, None)
 
 
-def _tables(
-    outcomes: Outcomes,
-    log_weight: FloatArray,
-    G: FloatArray,
-    usual: IntArray,
-    components: Components,
-    run: IntArray,
-    normals: Sequence[int],
-) -> Tables:
-    """Return what rows say of outcomes and of f in some normal distributions of theta.
+def _contiguous(tables: Sequence[FloatArray]) -> Tables:
+    return Tables(*(np.ascontiguousarray(table) for table in tables))
+
+
+def _of_f(
+    G: FloatArray, components: Components, run: IntArray, normal: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return G mu (place, moment, channel) and G V G^T over all moments of each place.
 
     Args:
-        outcomes: (place, moment, outcome, ...).
-        log_weight: (weight place, moment, outcome).
-        G: Columns of usual outcomes, (place, moment, usual, channel, theta).
-        usual: Usual outcome of each outcome.
+        G: (place, moment, channel, theta).
         components: What is believed of the robot.
         run: Of each place.
-        normals: Which normal distributions.
+        normal: Which normal distribution of theta.
     """
-    unknown, G = components.unknown, np.ascontiguousarray(G)
-    of_f = G[:, :, 0][..., unknown].reshape(len(G), G.shape[1] * G.shape[3], len(unknown))
-    means, covariances, residuals, extras = [], [], [], []
-    for normal in normals:
-        V, mu = components.theta(run, normal)
-        V, mu = V[:, unknown[:, None], unknown], np.ascontiguousarray(mu[:, unknown])
-        variance = np.ascontiguousarray(np.diagonal(V, axis1=1, axis2=2))
-        shift, spread = np.zeros(G.shape[:4]), np.zeros((*G.shape[:4], G.shape[3]))
-        _write_apart(G, unknown, variance, mu, shift, spread)
-        residuals.append(outcomes.residual - shift[:, :, usual])
-        extras.append(outcomes.beside + spread[:, :, usual])
-        means.append((of_f @ mu[..., None]).reshape(*G.shape[:2], G.shape[3]))
-        covariances.append(of_f @ V @ np.swapaxes(of_f, 1, 2))
-    tables = (
-        np.stack(residuals),
-        outcomes.scatter,
-        outcomes.late,
-        np.stack(extras),
-        log_weight,
-        np.stack(means),
-        np.stack(covariances),
-    )
-    return Tables(*(np.ascontiguousarray(table) for table in tables))
+    unknown = components.unknown
+    V, mu = components.theta(run, normal)
+    V, mu = V[:, unknown[:, None], unknown], mu[:, unknown]
+    whole = G[..., unknown].reshape(len(G), G.shape[1] * G.shape[2], len(unknown))
+    return (whole @ mu[..., None]).reshape(G.shape[:3]), whole @ V @ np.swapaxes(whole, 1, 2)
+
+
+def apart(
+    G: FloatArray,
+    components: Components,
+    run: IntArray,
+    normal: int,
+    without: Sequence[int] = (),
+) -> tuple[FloatArray, FloatArray]:
+    """Return what outcomes differ by from the first, as if parts of theta were independent.
+
+    Args:
+        G: (place, moment, outcome, channel, theta).
+        components: What is believed of the robot.
+        run: Of each place.
+        normal: Which normal distribution of theta.
+        without: Places in theta that are left out.
+
+    Returns:
+        Mean (place, moment, outcome, channel) [m] and covariance (..., channel, channel) [m2].
+    """
+    unknown = np.setdiff1d(components.unknown, np.array(without, dtype=np.int64))
+    V, mu = components.theta(run, normal)
+    variance = np.ascontiguousarray(np.diagonal(V, axis1=1, axis2=2)[:, unknown])
+    shift, spread = np.zeros(G.shape[:4]), np.zeros((*G.shape[:4], G.shape[3]))
+    known = np.ascontiguousarray(mu[:, unknown])
+    _write_apart(np.ascontiguousarray(G), unknown, variance, known, shift, spread)
+    return shift, spread
 
 
 @compiled
@@ -300,16 +326,26 @@ def narrowed(
     count = 1 + (left - (1.0 - total) > LEFT_OUT * total).sum(axis=-1)  # (pick, moment)
     kept = order[..., : count.max(initial=1)]
     moment = np.arange(share.shape[1])[None, :, None]
-    some, r = run[:, None, None], picks.row_of(rows.columns)[:, None, None]
-    G = rows.columns[some, r, moment, rows.usual[kept]]
+    some = run[:, None, None]
+    G = rows.columns_of(*np.broadcast_arrays(some, row[:, None, None], moment, rows.usual[kept]))
     index = some, picks.row_of(rows.outcomes.residual)[:, None, None], moment, kept
     outcomes = Outcomes(*(x[index] for x in rows.outcomes.arrays))
     log_weight = rows.log_weight[some, row[:, None, None], moment, kept]
     own_count = np.arange(kept.shape[-1]) < count[..., None]  # whatever its neighbours need
     log_weight = np.where(own_count, log_weight, -np.inf)
-    every, normals = np.arange(kept.shape[-1]), range(components.normals)
-    tables = _tables(outcomes, log_weight, G, every, components, run, normals)
-    return Prepared(tables, place, place, G[:, :, 0], kept)
+    normals = range(components.normals)
+    shift, spread = zip(*(apart(G, components, run, n) for n in normals), strict=True)
+    mean, covariance = zip(*(_of_f(G[:, :, 0], components, run, n) for n in normals), strict=True)
+    tables = (
+        outcomes.residual - np.stack(shift),
+        outcomes.scatter,
+        outcomes.late,
+        outcomes.beside + np.stack(spread),
+        log_weight,
+        np.stack(mean),
+        np.stack(covariance),
+    )
+    return Prepared(_contiguous(tables), place, place, G[:, :, 0], kept)
 
 
 def _kept(scene: Scene, rows: Rows, picks: Picks) -> FloatArray:

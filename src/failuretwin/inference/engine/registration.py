@@ -241,7 +241,7 @@ TELLS_NATS = 5.0
 
 CHUNK_ROWS = 1600
 """Moments of all runs that are weighed at a time, times those of a run: rows grow with them, and
-columns of all rows and outcomes stay below 100 MB."""
+what all rows say of outcomes stays below 100 MB."""
 
 
 def robot_posterior(

@@ -8,7 +8,7 @@ Section: docs/inference.md#hypotheses
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,8 @@ AmountPrior = Callable[[FloatArray, IntArray, IntArray], FloatArray]
 Onsets = Callable[[int, int, FloatArray], tuple[FloatArray, FloatArray]]
 """Samples of the onset of a run and row [s], and their shares, (sample,) each, given mean and
 deviation of its amount, (2,)."""
+ColumnsOf = Callable[[IntArray, IntArray, IntArray, IntArray], FloatArray]
+"""G by run, row, moment and usual outcome, (...,) each, as (..., channel, theta)."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,8 @@ class Rows:
         outcomes: Outcomes, (run, row or 1, moment, outcome, ...).
         log_weight: Their log probability, (run, row, moment, outcome).
         usual: Outcome of the healthy robot whose columns an outcome has, (outcome,).
-        columns: G of each usual outcome, (run, row or 1, moment, usual, channel, theta).
+        columns: G where every command arrives, (run, row or 1, moment, channel, theta).
+        columns_of: G of other usual outcomes too: there are too many to keep those of all.
         lever: H, (run, row, moment, channel).
         centre: Amount at z = 0, (run, row).
         variance: var(z) before its prior is put in, (run, row); 0 without an amount.
@@ -64,6 +67,7 @@ class Rows:
         onsets: Onset of a run and row; None: no fault.
         tie: What theta adds to the amount, so that the amount itself is less in doubt,
             (run, row, theta); None: nothing.
+        own: Places in theta that say nothing any more from the onset on.
     """
 
     log_prior: FloatArray
@@ -72,6 +76,7 @@ class Rows:
     log_weight: FloatArray
     usual: IntArray
     columns: FloatArray
+    columns_of: ColumnsOf
     lever: FloatArray
     centre: FloatArray
     variance: FloatArray
@@ -79,6 +84,7 @@ class Rows:
     drawn: Drawn | None = None
     onsets: Onsets | None = None
     tie: FloatArray | None = None
+    own: Sequence[int] = ()
 
 
 @dataclass(frozen=True)
@@ -138,6 +144,13 @@ class Scene:
         healthy = Outcomes.of_poses(moments, shown, model.scatter**2, *beside)
         return cls(model, moments, priors, noise, layout, G, spread, pose, shown, healthy)
 
+    def columns_of(
+        self, run: IntArray, row: IntArray, moment: IntArray, outcome: IntArray
+    ) -> FloatArray:
+        """Return G of a healthy robot, whatever the row; see `ColumnsOf`."""
+        del row
+        return self.columns[run, moment, outcome]
+
     @property
     def settled(self) -> FloatArray:
         """Settled angles where every command arrives, (run, moment, motor) [rad]."""
@@ -154,8 +167,14 @@ def sampled(onset: FloatArray, share: FloatArray) -> Onsets:
     return lambda run, row, _: (onset[run, row], share[run, row])
 
 
-def before_onset(rows: Rows, healthy: Outcomes, columns_of: FloatArray) -> Rows:
-    """Return rows whose moments before the first affected one are those of a healthy robot."""
+def arrived(columns_of: ColumnsOf, rows: int, moments: Moments) -> FloatArray:
+    """Return G where every command arrives, (run, row, moment, channel, theta)."""
+    run, row, moment, outcome = np.indices((moments.runs, rows, moments.count, 1))[..., 0]
+    return columns_of(run, row, moment, outcome)
+
+
+def before_onset(rows: Rows, healthy: Outcomes) -> Rows:
+    """Return rows whose outcomes before the first affected moment are those of a healthy robot."""
     count = rows.log_weight.shape[2]
     mask = (np.arange(count) < rows.first[:, None])[None, :, :, None]
 
@@ -164,9 +183,4 @@ def before_onset(rows: Rows, healthy: Outcomes, columns_of: FloatArray) -> Rows:
 
     pairs = zip(healthy.with_rows().arrays, rows.outcomes.arrays, strict=True)
     outcomes = Outcomes(*(pick(*pair) for pair in pairs))
-    return replace(
-        rows,
-        outcomes=outcomes,
-        columns=pick(columns_of[:, None], rows.columns),
-        lever=np.where(mask, 0.0, rows.lever),
-    )
+    return replace(rows, outcomes=outcomes, lever=np.where(mask, 0.0, rows.lever))

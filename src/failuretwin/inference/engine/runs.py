@@ -138,7 +138,7 @@ class RunsEvidence:
     @cached_property
     def prepared(self) -> list[Prepared]:
         """Rows of each hypothesis ready for the filter: those that count, once all are weighed."""
-        return [prepared(rows, self.components) for rows in self.rows]
+        return [prepared(self.scene, rows, self.components) for rows in self.rows]
 
     @cached_property
     def left_out(self) -> dict[int, FloatArray]:
