@@ -267,8 +267,8 @@ class SetUpWeighing:
             says = likelihood.profile(k)
             seen = likelihood.usable & (says.min_distance2[..., 0] < EXPLAINED)
             away = says.turned(says.mode - says.expected)[..., 0]
-            agreed = _agreed(away[seen], width, least)
-            values = [z for z in agreed if not right_in_some(away, seen, z, width)] + list(also)
+            values = [*_agreed(away[seen], width, least), *also]
+            values = [z for z in values if not right_in_some(away, seen, z, width)]
             tried = self.weigh([self._off(first, k, value) for value in values])
             log_joint = [one.log_joint for one in tried]
             if max(log_joint, default=-np.inf) > told - HOPELESS_NATS:
