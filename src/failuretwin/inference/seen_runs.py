@@ -190,7 +190,9 @@ class SeenRuns:
             if found is not None:
                 first = found.beside(first)
                 seen = self.under(first.correction)
-        posterior = SetUpWeighing(seen.sample, self.hypotheses, self.priors).posterior(thorough)
+        known = seen.weighed_sample if seen.sample.evidence.on_the_way.all() else ()
+        weighing = SetUpWeighing(seen.sample, self.hypotheses, self.priors, known)
+        posterior = weighing.posterior(thorough)
         return posterior.beside(first) if first.what else posterior
 
     def unit(self) -> SetUp | None:

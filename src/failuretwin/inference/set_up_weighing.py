@@ -28,6 +28,7 @@ from failuretwin.inference.engine.registration import (
 )
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.engine.theta import offset_deviation, offsets_doubted
+from failuretwin.inference.engine.weighing import Weighing
 from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import highest_and_outlier
@@ -74,11 +75,13 @@ class SetUpWeighing:
         likelihood: Runs by their settled positions, as they were seen.
         hypotheses: What may be the case.
         priors: Beliefs about faults and set-ups.
+        known: The same runs weighed as told, where that is how all set-ups are weighed.
     """
 
     likelihood: RunLikelihood
     hypotheses: Sequence[Hypothesis]
     priors: Priors
+    known: Sequence[Weighing] = ()
 
     @cached_property
     def as_told(self) -> SetUp:
@@ -133,7 +136,10 @@ class SetUpWeighing:
         for first in range(0, len(set_ups), at_a_time):
             some = set_ups[first : first + at_a_time]
             likelihood = self.behind(some)
-            says = evidence_at_once(likelihood, hypotheses, self.priors)
+            if self.known and likelihood is self.likelihood:
+                says = np.concatenate([one.by_hypothesis for one in self.known])[:, asked]
+            else:
+                says = evidence_at_once(likelihood, hypotheses, self.priors)
             found += _weighed(some, likelihood, log_sum(says + log_odds, axis=1))
         return found
 
@@ -183,7 +189,7 @@ class SetUpWeighing:
     @cached_property
     def few(self) -> SetUpWeighing:
         """The same by few of the runs."""
-        return replace(self, likelihood=self._some(FEW))
+        return replace(self, likelihood=self._some(FEW), known=())
 
     def _some(self, most: int) -> RunLikelihood:
         """Return so many of the runs at most, evenly spread."""
