@@ -3,10 +3,10 @@
     p(h | run) = sum over c of p(c | run) p(h | run, c)
     p(c | run) ~ w_c sum over h of p(h) p(run | h, c)
 
-with components c of the belief about the healthy robot: the named calibration; the population of
-its class, whose scatter and noise the engine sums over; and that with more lost commands.
-p(c | run) is that of settled positions, which every component judges. A component is weighed in
-full for the runs that it may explain better: its healthy and its likeliest hypothesis tell which.
+with components c of the belief about the healthy robot: the named calibration, and the population
+of its class, whose scatter, noise and losses the engine sums over. p(c | run) is that of settled
+positions, which both judge. The population is weighed in full for the runs that it may explain
+better: its healthy hypothesis and the likeliest so far tell which.
 
 Section: docs/inference.md#robot-mixture
 """
@@ -23,7 +23,6 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import generic_imperfections
-from failuretwin.digital_model.nonidealities import with_rates
 from failuretwin.inference.engine.registration import robot_evidence, run_posterior
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.faults.priors import Priors
@@ -31,8 +30,6 @@ from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
 
-LOSSES = {3.0: 0.15}
-"""Factors on the rates of lost commands of the class, and the share of robots of each; assumed."""
 COUNTS_NATS = 3.0
 """A component counts for a run where it comes within this of what explains the run best [nats]."""
 TOLD = 0.9
@@ -57,40 +54,22 @@ class RobotComponent:
 def robot_components(model: HealthyModel, priors: Priors) -> list[RobotComponent]:
     """Return what is believed of a healthy robot; the first is the model itself.
 
-    An ideal robot, one whose set-up is known, and one that other sensors watch have no other.
+    A robot of its class, an ideal one, one whose set-up is known, and one that other sensors watch
+    have no other.
 
     Args:
         model: The named calibration, or the population of its class.
         priors: Beliefs about set-ups.
     """
     another, known = priors.setup.another_rate, model.imperfections
-    if another == 0.0 or known.settling is None or not model.sensors.tool_alone:
+    nothing = another == 0.0 or known.settling is None or known.of_class
+    if nothing or not model.sensors.tool_alone:
         return [RobotComponent("", 0.0, model)]
-    if known.of_class:
-        return _population(model, "", 1.0)
-    name = f"these runs do not seem to be of the robot of calibration {known.name!r}"
     usual = generic_imperfections(model.twin.robot)
     usual = replace(usual, protocol=known.protocol, sensors=known.sensors)
-    kind = _population(replace(model, imperfections=usual), name, another)
-    return [RobotComponent("", float(np.log1p(-another)), model), *kind]
-
-
-def _population(model: HealthyModel, name: str, rate: float) -> list[RobotComponent]:
-    """Return the population of a class: as usual first, then with more lost commands.
-
-    Args:
-        model: The population.
-        name: What is said of a run that it explains.
-        rate: Probability of the population.
-    """
-    usual = rate * (1.0 - sum(LOSSES.values()))
-    found = [RobotComponent(name, float(log_of(usual)), model)]
-    for factor, share in LOSSES.items():
-        lossy = replace(model, imperfections=with_rates(model.imperfections, factor))
-        told = f"commands seem to get lost about {factor:g} times as often as with such arms"
-        told = "; ".join(filter(None, (name, told)))
-        found.append(RobotComponent(told, float(log_of(rate * share)), lossy))
-    return found
+    told = f"these runs do not seem to be of the robot of calibration {known.name!r}"
+    kind = RobotComponent(told, float(log_of(another)), replace(model, imperfections=usual))
+    return [RobotComponent("", float(np.log1p(-another)), model), kind]
 
 
 @dataclass(frozen=True)
@@ -139,27 +118,24 @@ class RobotMixture:
         in_doubt: bool,
         common: Sequence[str] = (),
     ) -> RobotMixture:
-        """Weigh the other components where they may explain a run better.
+        """Weigh the other component, if there is one, where it may explain a run better.
 
         Args:
             named: Posterior by the first component.
             components: Beliefs about the healthy robot.
             priors: Beliefs about faults and set-ups.
-            in_doubt: Whether the sensor may stand elsewhere: weighed with the first two, since what
-                differs from the usual robot explains the same runs.
+            in_doubt: Whether the sensor may stand elsewhere.
             common: What is said of the log of all runs.
         """
         first, *others = components
-        alone = replace(named.likelihood, moving=None)
-        mixture = cls([RobotPosterior(first, np.arange(len(named.log_posterior)), named)], common)
+        parts = [RobotPosterior(first, np.arange(len(named.log_posterior)), named)]
         for one in others:
-            likelihood = RunLikelihood(alone.evidence, one.model)
-            some = mixture.rows_to_weigh(one, likelihood, priors)
+            likelihood = RunLikelihood(named.likelihood.evidence, one.model)
+            some = cls(parts, common).rows_to_weigh(one, likelihood, priors)
             if len(some):
-                doubt = in_doubt and one is others[0]
-                says = run_posterior(likelihood[some], named.hypotheses, priors, doubt)
-                mixture = cls([*mixture.parts, RobotPosterior(one, some, says)], common)
-        return mixture
+                says = run_posterior(likelihood[some], named.hypotheses, priors, in_doubt)
+                parts.append(RobotPosterior(one, some, says))
+        return cls(parts, common)
 
     @cached_property
     def log_joint(self) -> FloatArray:
@@ -178,15 +154,14 @@ class RobotMixture:
     def rows_to_weigh(
         self, component: RobotComponent, likelihood: RunLikelihood, priors: Priors
     ) -> IntArray:
-        """Return the runs that a component may explain better, by its healthy hypothesis.
+        """Return the runs that another component may explain better.
 
-        The first component behind the named one is asked for the best hypothesis so far too.
+        Its healthy hypothesis tells, and the best one so far.
         """
         known, best = self.parts[0].posterior, np.argmax(self.log_posterior, axis=1)
         many = range(len(known.hypotheses))
-        asked = np.tile([h.is_healthy for h in known.hypotheses], (len(best), 1))
-        if len(self.parts) == 1:
-            asked = asked | (best[:, None] == np.array(many))
+        asked = best[:, None] == np.array(many)
+        asked |= [h.is_healthy for h in known.hypotheses]
         scored = [i for i in many if asked[:, i].any() and has_rows(known.hypotheses[i])]
         if not scored:
             return np.arange(len(best))

@@ -26,6 +26,8 @@ KEPT_ON_CURVES = 0.7
 BEND, OWN_BEND = 0.5, 0.3
 """Share of `Stretches.bend` by which motors are off, in the mean, and the deviation of each from
 what they share; assumed."""
+LOSSY = 3.0
+"""How many times as often as usual commands get lost in some robots; assumed."""
 MOST_OUTCOMES = 12
 """Outcomes of a movement that are weighed: the most probable ones."""
 
@@ -46,6 +48,8 @@ class Moments:
         direction: Sign of their last travel; on the way, of their friction, same axes.
         lost: Motors that miss their command, same axes.
         log_weight: Log probability of each outcome, (run, moment, outcome).
+        lossy: Log of how much more probable each is where commands get lost `LOSSY` times as often,
+            (run, moment, outcome).
         outcome: Index of each among all outcomes of the movement, (run, moment, outcome).
         speed: Of each motor, (run, moment, outcome, motor) [rad/s]; 0 at rest.
         bend: What an acceleration may put it off by, same axes [rad]; 0 at rest.
@@ -68,6 +72,7 @@ class Moments:
     direction: FloatArray
     lost: BoolArray
     log_weight: FloatArray
+    lossy: FloatArray
     outcome: IntArray
     speed: FloatArray
     bend: FloatArray
@@ -106,6 +111,9 @@ def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
     usual = model.outcomes_as_seen(evidence)
     density = model.explain(evidence, usual).density
     outcomes = model.filtered_outcomes(evidence, usual, density)
+    often = model.filtered_outcomes(evidence, usual, density, LOSSY).log_weight
+    possible = np.isfinite(outcomes.log_weight)
+    lossy = np.where(possible, often, 0.0) - np.where(possible, outcomes.log_weight, 0.0)
     movements = Stretches.of(evidence.movements)
     target, origin = np.nan_to_num(movements.target), np.nan_to_num(movements.origin())
     part = ~movements.whole[..., None] & outcomes.lost.any(axis=-1)  # lost as a whole, or not
@@ -129,6 +137,7 @@ def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
         direction=np.where(lost | np.isnan(turned), direction, turned),
         lost=lost,
         log_weight=weight,
+        lossy=np.take_along_axis(lossy, chosen, axis=2),
         outcome=chosen,
         speed=speed,
         bend=bend,
@@ -176,6 +185,7 @@ def _with_waiting(moments: Moments, late: FloatArray) -> Moments:
         direction=more("direction", moments.direction[:, :, :1]),
         lost=np.concatenate([moments.lost, np.ones_like(moments.lost[:, :, :1])], axis=2),
         log_weight=np.concatenate([weight + log_of(1.0 - late)[..., None], waits], axis=-1),
+        lossy=np.concatenate([moments.lossy, moments.lossy[..., :1]], axis=-1),
         outcome=np.concatenate([moments.outcome, np.zeros_like(moments.outcome[..., :1])], axis=-1),
         speed=more("speed", still),
         bend=more("bend", still),

@@ -245,6 +245,25 @@ class Part:
         assert self.prepared.kept is not None
         return self.prepared.kept[self.place]
 
+    def log_losses(self, share: FloatArray) -> FloatArray:
+        """Return by how much more probable picks are where commands get lost more often, (pick,).
+
+        Moments of one movement share its outcome: the last one tells which it was.
+
+        Args:
+            share: Share of each outcome, (pick, moment, outcome).
+        """
+        moments, run = self.scene.moments, self.picks.run
+        begins = np.maximum.accumulate(
+            np.where(moments.kept > 0.0, 0, np.arange(moments.count)), axis=1
+        )
+        ends = np.diff(begins, append=moments.count, axis=1) > 0
+        outcome = np.arange(share.shape[-1]) if self.prepared.kept is None else self.kept
+        usual = np.broadcast_to(self.rows.usual[outcome], share.shape)
+        lossy = moments.lossy[run[:, None, None], begins[run][..., None], usual]
+        known = np.sum(share * np.expm1(lossy), axis=-1)
+        return np.asarray(np.sum(np.where(ends[run], np.log1p(known), 0.0), axis=1))
+
     def filtered(self) -> RowsPosterior:
         """Return what moments say, one after the other."""
         return filter_picks(self.prepared.tables, self._places, self.scene.noise)

@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.core.numerics import log_sum
+from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
@@ -54,12 +54,14 @@ class Weighed:
         log_evidence: With the prior of rows and amounts, without that of components, (pick,).
         found: Filtered moments.
         amount: Mean and deviation of the amount, (pick, 2).
+        lossy: Probability that commands get lost more often, (pick,).
     """
 
     picks: Picks
     log_evidence: FloatArray
     found: RowsPosterior
     amount: FloatArray
+    lossy: FloatArray
 
     @classmethod
     def joined(cls, parts: Sequence[Weighed]) -> Weighed:
@@ -69,13 +71,17 @@ class Weighed:
             np.concatenate([one.log_evidence for one in parts]),
             RowsPosterior.joined([one.found for one in parts]),
             np.concatenate([one.amount for one in parts]),
+            np.concatenate([one.lossy for one in parts]),
         )
 
     def with_picks(self, places: IntArray, some: Weighed) -> Weighed:
         """Return the same with some of the picks weighed anew."""
-        log_evidence, amount = self.log_evidence.copy(), self.amount.copy()
-        log_evidence[places], amount[places] = some.log_evidence, some.amount
-        return Weighed(self.picks, log_evidence, self.found.with_picks(places, some.found), amount)
+        arrays = [x.copy() for x in (self.log_evidence, self.amount, self.lossy)]
+        for values, new in zip(arrays, (some.log_evidence, some.amount, some.lossy), strict=True):
+            values[places] = new
+        log_evidence, amount, lossy = arrays
+        found = self.found.with_picks(places, some.found)
+        return Weighed(self.picks, log_evidence, found, amount, lossy)
 
 
 def _by_components(picks: Picks, run: IntArray, component: IntArray) -> Picks:
@@ -218,6 +224,15 @@ class RunsEvidence:
         """Log p(run | h), (run, hypothesis)."""
         return log_sum(self.log_evidence, axis=1)
 
+    @cached_property
+    def lossy(self) -> FloatArray:
+        """Probability that commands get lost more often, by each hypothesis, (run, hypothesis)."""
+        found, whole = np.zeros(self.by_hypothesis.shape), self.by_hypothesis + self.log_odds
+        for h, one in enumerate(self.weighed):
+            share = np.exp(self.height(h) - whole[one.picks.run, h])
+            np.add.at(found[:, h], one.picks.run, share * one.lossy)
+        return found
+
     def reweighted(self, log_weight: FloatArray) -> RunsEvidence:
         """Return the same rows by components of other weights, (run, component)."""
         other = replace(self, components=replace(self.components, log_weight=log_weight))
@@ -311,11 +326,11 @@ class RunsEvidence:
             found = [one.filtered() for one in parts]
         else:
             found = [one.refined(known) for one, known in zip(parts, before, strict=True)]
-        return [self._weighed(h, *one) for h, one in enumerate(zip(picks, found, strict=True))]
+        return [self._weighed(h, *one) for h, one in enumerate(zip(parts, found, strict=True))]
 
-    def _weighed(self, h: int, picks: Picks, found: RowsPosterior) -> Weighed:
-        """Return what rows of a hypothesis say, with the prior of rows and amounts."""
-        rows = self.rows[h]
+    def _weighed(self, h: int, part: Part, found: RowsPosterior) -> Weighed:
+        """Return what rows of a hypothesis say, with the prior of rows, amounts and losses."""
+        rows, picks = part.rows, part.picks
         total = found.total + rows.log_prior[picks.run, picks.row]
         if h in self.left_out:
             total = total + self.left_out[h][picks.run]
@@ -326,7 +341,22 @@ class RunsEvidence:
         else:
             gain, amount = _with_amount_prior(rows, picks, amount)
             total = total + gain
-        return Weighed(picks, total, found, amount)
+        more, lossy = self._with_losses(part, found)
+        return Weighed(picks, total + more, found, amount, lossy)
+
+    def _with_losses(self, part: Part, found: RowsPosterior) -> tuple[FloatArray, FloatArray]:
+        """Return what robots that lose more commands change, and how probable they are, (pick,).
+
+            p(row) ~ (1 - s) + s R,    R = prod over movements sum over a of p(a | row) w'_a / w_a
+
+        with the share s of such robots and the weight w'_a of an outcome a in them.
+        """
+        share = self.components.lossy
+        if share == 0.0:
+            return np.zeros(len(part.picks.run)), np.zeros(len(part.picks.run))
+        usual, more = log_of(1.0 - share), log_of(share) + part.log_losses(found.share)
+        total = np.logaddexp(usual, more)
+        return total, np.exp(more - total)
 
 
 def _with_amount_prior(

@@ -109,6 +109,7 @@ class Components:
         jitter: Factor on the deviation of when motors start, (component,).
         noise_m: Noise of the sensor, (component,) [m].
         displaced: Whether the sensor stands elsewhere than the profile says, (component,).
+        lossy: Share of robots that lose commands `moments.LOSSY` times as often, in each component.
     """
 
     log_weight: FloatArray
@@ -119,6 +120,7 @@ class Components:
     jitter: FloatArray
     noise_m: FloatArray
     displaced: BoolArray
+    lossy: float = 0.0
 
     @classmethod
     def normal_of(
@@ -212,6 +214,7 @@ class Components:
             np.concatenate([one.jitter for one in parts]),
             np.concatenate([one.noise_m for one in parts]),
             np.concatenate([one.displaced for one in parts]),
+            max(one.lossy for one in parts),
         )
 
     def weight(self, run: IntArray, component: IntArray) -> FloatArray:
@@ -295,17 +298,19 @@ def layout_of(model: HealthyModel, moving: bool = False) -> Layout:
 
 @dataclass(frozen=True)
 class ScaleFactors:
-    """Factors on scatter, noise and jitter, and the share of robots of each.
+    """Factors on scatter, noise and jitter with the share of robots of each, and lossy robots.
 
     Attributes:
         scatter: On the scatter of the motors.
         noise: On the noise of the sensor.
         jitter: On the deviation of when motors start, of robots that are seen on the way.
+        lossy: Share of robots that lose commands `moments.LOSSY` times as often.
     """
 
     scatter: Mapping[float, float]
     noise: Mapping[float, float]
     jitter: Mapping[float, float]
+    lossy: float = 0.0
 
 
 JITTER = {1.0: 0.4, 0.4: 0.4, 2.5: 0.2}
@@ -316,6 +321,7 @@ OF_CLASS = ScaleFactors(
     {0.5: 0.25, 1.0: 0.4, 2.0: 0.2, 4.0: 0.1, 9.0: 0.05},
     {0.1: 0.2, 0.3: 0.15, 1.0: 0.5, 3.0: 0.1, 8.0: 0.05},
     JITTER,
+    lossy=0.15,
 )
 """Of robots that nobody has calibrated; assumed, heavy above 1."""
 SINCE_CALIBRATED = ScaleFactors(
@@ -360,6 +366,7 @@ def robot_components(model: HealthyModel, layout: Layout, factors: ScaleFactors)
         np.array(tau),
         model.path_noise * np.array(kappa),
         np.zeros(len(sigma), dtype=bool),
+        factors.lossy,
     )
 
 

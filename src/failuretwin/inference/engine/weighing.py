@@ -21,8 +21,10 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.failure_behavior.mode import Signature
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.healthy_rows import changes
-from failuretwin.inference.engine.moments import moments_of
+from failuretwin.inference.engine.moments import LOSSY, moments_of
 from failuretwin.inference.engine.posterior import (
     marginal_likelihoods as engine_likelihoods,
 )
@@ -175,9 +177,18 @@ class Weighing:
         settled = np.stack([one.log_evidence for one in self._settled_at_best], axis=1)
         rows, (best, _) = np.arange(len(found)), self.best
         more = settled - settled[rows, self.with_rows[best], None]
+        more[:, self._missing] -= np.log1p(-self.components.lossy) - np.log1p(
+            -self.evidence.lossy[rows, best, None]
+        )
         table = found[rows, :, best][..., None] + more[:, None]
         table[..., self.with_rows] = found
         return np.asarray(table)
+
+    @cached_property
+    def _missing(self) -> IntArray:
+        """Hypotheses that a motor misses commands: they need no robot that loses more of them."""
+        modes = [[MODES[fault.mode] for fault in h.faults] for h in self.hypotheses]
+        return np.flatnonzero([any(m.signature is Signature.MISSED for m in ms) for ms in modes])
 
     @property
     def log_joint_at_rest(self) -> FloatArray:
@@ -241,6 +252,13 @@ class Weighing:
         height = self.log_evidence + self.log_odds
         return np.exp(height - log_sum(height, axis=(1, 2))[:, None, None])
 
+    @cached_property
+    def lossy(self) -> FloatArray:
+        """Probability that the robot of each run loses more commands, (run,)."""
+        height = self.evidence.by_hypothesis + self.evidence.log_odds
+        share = np.exp(height - log_sum(height, axis=1)[:, None])
+        return np.sum(share * self.evidence.lossy, axis=1)
+
     @property
     def remarks(self) -> list[str]:
         """What each run had to assume of its robot and its sensor; empty where nothing."""
@@ -270,6 +288,11 @@ class Weighing:
             noise = 1e3 * components.noise_m[int(np.argmax(np.where(noisy, share, 0.0)))]
             said.append(
                 f"the sensor seems noisier than is known of it: by about {noise:.2g} mm; judged so"
+            )
+        if self.lossy[run] > TOLD:
+            said.append(
+                f"commands seem to get lost about {LOSSY:g} times as often as with such arms; "
+                "judged so"
             )
         if self._loaded[run]:
             said.append(self._loaded[run])

@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 from failuretwin.core.movements import Movements
 from failuretwin.core.numerics import log_of
 from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray, IntArray
-from failuretwin.digital_model.nonidealities import Imperfections
+from failuretwin.digital_model.nonidealities import Imperfections, with_rates
 from failuretwin.digital_model.robot import Robot
 
 Values = TypeVar("Values", FloatArray, BoolArray)
@@ -241,6 +241,7 @@ class LostCommands:
         late: FloatArray,
         log_likelihood: FloatArray,
         arrived: FloatArray | None = None,
+        times: float = 1.0,
     ) -> CommandOutcomes:
         """Return outcomes with their probability given what was seen of the movements before.
 
@@ -253,21 +254,25 @@ class LostCommands:
                 constant, (run, movement, outcome); 0 where nothing was seen.
             arrived: Whether each motor reports to have received its command, (run, movement,
                 motor), NaN where it does not tell; None: nowhere.
+            times: How many times as often commands get lost.
         """
-        rates = self._rates(late)
+        rates = self._rates(late, times)
         if arrived is not None and np.isfinite(arrived).any():
             rates = self._given_goals(rates, arrived)
         chances = self._in_a_row.forward(rates, log_likelihood)
         chances[chances < NEGLIGIBLE] = 0.0
         return replace(outcomes, log_weight=self._log_weight(chances))
 
-    def _rates(self, late: FloatArray) -> FloatArray:
+    def _rates(self, late: FloatArray, times: float = 1.0) -> FloatArray:
         """Return the probability of each loss, (run, movement, loss); the first: of none.
 
         Args:
             late: Probability that each movement started late, (run, movement).
+            times: As of `filtered_outcomes`.
         """
-        entries = self.imperfections.lost_commands
+        entries = (
+            with_rates(self.imperfections, times) if times != 1.0 else self.imperfections
+        ).lost_commands
         rates = [entry.rate + (entry.rate_when_late - entry.rate) * late for entry in entries]
         total = sum(rates, np.zeros_like(late))
         none = np.maximum(1.0 - total, 0.0)

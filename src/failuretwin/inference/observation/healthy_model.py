@@ -328,7 +328,11 @@ class HealthyModel:
         return self.lost_commands.outcomes(movements, standing)
 
     def filtered_outcomes(
-        self, evidence: SettledEvidence, outcomes: CommandOutcomes, density: FloatArray
+        self,
+        evidence: SettledEvidence,
+        outcomes: CommandOutcomes,
+        density: FloatArray,
+        times: float = 1.0,
     ) -> CommandOutcomes:
         """Return outcomes with their probability given what was seen of the movements before.
 
@@ -336,11 +340,12 @@ class HealthyModel:
             evidence: Settled positions.
             outcomes: What may have become of each movement, whatever was seen.
             density: How well each explains the settled positions, from `explain`.
+            times: How many times as often as usual commands get lost.
         """
         says = np.logaddexp(np.log1p(-OUTLIER_RATE) + density, self.outlier_log_density)
         says = np.where(evidence.usable[..., None], says, 0.0)
         late = self.late(evidence.movements, evidence.first_reading_delay)
-        return self.lost_commands.filtered_outcomes(outcomes, late, says, evidence.arrived)
+        return self.lost_commands.filtered_outcomes(outcomes, late, says, evidence.arrived, times)
 
     def late(
         self, movements: Movements, first_reading_delay: FloatArray | None = None
