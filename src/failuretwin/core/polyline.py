@@ -23,9 +23,6 @@ TURN_RAD = 1e-5
 REST_S = 0.3
 """Shortest rest of all motors in a reference guided by hand [s]: twice the 0.15 s by which such an
 arm lags, so that the arm is measured at rest too."""
-LONGEST_CORNER_S = 0.6
-"""Longest time between two samples in which a corner is looked for [s]: commands that come at 1 Hz
-are the corners themselves."""
 STAIR_QUANTA = 4.0
 """Largest step of a staircase, in quanta; a larger step is a ramp or a jump."""
 SAME = 1e-9
@@ -147,14 +144,20 @@ def _sharpen(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return times and values of the corners `kept`, and which of them belong to rests.
 
-    A corner between two samples lies where their lines meet, unless these are far apart in time;
-    `fixed` marks starts and ends of rests.
+    A corner between two samples lies where the lines beside them meet, if both are lines: they have
+    a sample between their ends, or are rests, whose starts and ends `fixed` marks. Samples of a
+    curve are the corners themselves.
     """
+
+    def is_line(first: int) -> bool:
+        ends = kept[first : first + 2]
+        return bool(ends[1] - ends[0] > 1 or fixed[ends].all())
+
     corners = [(float(time[i]), float(value[i])) for i in kept]
     sharp, rests, i = corners[:1], [bool(fixed[kept[0]])], 1
     while i < len(corners):
         between = i + 2 < len(corners) and kept[i + 1] - kept[i] == 1
-        between = between and corners[i + 1][0] - corners[i][0] <= LONGEST_CORNER_S
+        between = between and is_line(i - 1) and is_line(i + 1)
         met = _meet(sharp[-1], corners[i], corners[i + 1], corners[i + 2]) if between else None
         sharp.append(met or corners[i])
         rests.append(bool(fixed[kept[i]] or (met is not None and fixed[kept[i + 1]])))

@@ -107,6 +107,11 @@ class SeenRuns:
         """How far the tool trails its commands in runs that hardly rest [s]."""
         return likeliest_lag(self.evidence.sound, self.model)
 
+    @property
+    def _told_too_seldom(self) -> bool:
+        """Whether no run tells its way: what happens to be seen of it says nothing of set-ups."""
+        return bool(told_too_seldom(self.evidence.sound, self.model, self.lag_s).all())
+
     @cached_property
     def healthy(self) -> HealthyModel:
         """The healthy robot as these runs show it, with what was rounded off as noise."""
@@ -182,7 +187,7 @@ class SeenRuns:
             thorough: Whether all set-ups are weighed, also where the one as told fits.
         """
         told = SetUpWeighing(self.sample, self.hypotheses, self.priors)
-        if told.rate == 0.0 or not self.model.sensors.tool_alone:
+        if told.rate == 0.0 or not self.model.sensors.tool_alone or self._told_too_seldom:
             return told.taken_as_told()
         first, seen = told.as_told, self
         for look in (SeenRuns.unit, SeenRuns.clock):
@@ -208,8 +213,6 @@ class SeenRuns:
 
     def clock(self) -> SetUp | None:
         """Return by how much the clocks are apart; None where that is not sure."""
-        if told_too_seldom(self.evidence.sound, self.model, self.lag_s).all():
-            return None
         found = clock_posterior(self.evidence.sound, self.model)
         if found.apart < SURE:
             return None

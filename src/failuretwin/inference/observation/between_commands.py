@@ -36,8 +36,9 @@ ENDS, MIDDLE = 0.15, 0.35
 """Readings count as at a corner within this share of a stretch, between two from that share on."""
 FEWEST = 4
 """Stretches from which that is told."""
-LEAST_S = 0.7
-"""Shortest stretch that counts [s]: lines between closer commands are near enough to a curve."""
+LEAST_S, LEAST_STEADY_S = 0.7, 0.25
+"""Shortest stretch that counts [s], and where commands come at a steady rate: lines between closer
+commands are near enough to a curve; an arm that lags leaves those of short ramps."""
 CORNER_RAD_S, SAME_CORNER_S = 1e-3, 0.05
 """A command turns a corner where its speed changes by more [rad/s]; corners this near are one
 [s]."""
@@ -58,17 +59,20 @@ def strays_between(
     for run in np.flatnonzero(runs).tolist():
         command, time = (as_floats(evidence.runs[n].values) for n in ("command", "time"))
         corners = _corners(command[run], time)
-        middle, ends, deviation = _off(evidence, model, run, lag_s, corners)
+        steady = len(corners) > FEWEST and _steady(corners)
+        least, share = (LEAST_STEADY_S, SHARE_STEADY) if steady else (LEAST_S, SHARE)
+        long = np.array([pair for pair in pairwise(corners.tolist()) if pair[1] - pair[0] >= least])
+        middle, ends, deviation = _off(evidence, model, run, lag_s, long.reshape(-1, 2))
         if len(middle) >= FEWEST:
             strays = (middle > STRAYS * ends) & (middle > SEEN * deviation)
-            found[run] = strays.mean() >= (SHARE_STEADY if _steady(corners) else SHARE)
+            found[run] = strays.mean() >= share
     return found
 
 
 def _off(
-    evidence: Evidence, model: HealthyModel, run: int, lag_s: float, corners: FloatArray
+    evidence: Evidence, model: HealthyModel, run: int, lag_s: float, stretches: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return how far the tool is off in the middle of each stretch, and at its worse end.
+    """Return how far the tool is off in the middle of stretches (begin, end), and at the worse end.
 
     Returns:
         Both, and the deviation of a healthy arm there, (stretch,) [m].
@@ -79,11 +83,11 @@ def _off(
     off = np.linalg.norm(evidence.readings.point[run][seen] - expected, axis=-1)
     spread = np.sum((jacobian * model.scatter) ** 2, axis=(-2, -1)) + 3.0 * model.path_noise**2
     rows = list[list[float]]()
-    for begin, end in pairwise(corners.tolist()):
+    for begin, end in stretches.tolist():
         share = (when - begin) / (end - begin)
         first, last = np.abs(share) < ENDS, np.abs(share - 1.0) < ENDS
         middle = np.abs(share - 0.5) < 0.5 - MIDDLE
-        if end - begin >= LEAST_S and first.any() and last.any() and middle.any():
+        if first.any() and last.any() and middle.any():
             worse = max(np.median(off[first]), np.median(off[last]))
             deviation = np.sqrt(np.median(spread[middle]))
             rows.append([float(np.median(off[middle])), float(worse), float(deviation)])

@@ -129,17 +129,20 @@ def likeliest_lag(evidence: Evidence, model: HealthyModel) -> float:
 def on_the_way(evidence: Evidence, model: HealthyModel, lag_s: float) -> SettledEvidence:
     """Return settled positions, and moments on the way of runs that hardly rest.
 
-    None of runs whose tool leaves the straight way between commands.
+    None of runs whose tool leaves the straight way between commands; where their curves end is not
+    known either.
 
     Args:
         evidence: What the runs say.
         model: The healthy robot: how early its ramps end.
         lag_s: How far the tool trails its commands [s], as `likeliest_lag` returns it.
     """
-    settled = evidence.settled
-    hardly = hardly_rest(evidence, model) & ~told_too_seldom(evidence, model, lag_s)
+    settled, curves = evidence.settled, long_curves(evidence)
+    strays = told_too_seldom(evidence, model, lag_s)
+    hardly = hardly_rest(evidence, model) & ~strays
     unseen = settled.movements.exists & ~settled.usable & _few_rests(evidence, model)[:, None]
-    unseen = (unseen | long_curves(evidence)) & hardly[:, None]
+    unseen = (unseen | curves) & hardly[:, None]
+    settled = replace(settled, usable=settled.usable & ~(curves & strays[:, None]))
     if not unseen.any():
         return settled
     looks = _Looks(evidence, model, lag_s)
