@@ -9,8 +9,11 @@ from failuretwin.app.commands.learn import _wrong_set_up
 from failuretwin.app.reports.calibration_report import calibration_parts
 from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Schedule
+from failuretwin.digital_model.robot import load_robot
 from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.inference.engine.theta import has_geometry
 from failuretwin.inference.seen_runs import SeenRuns
 from failuretwin.inference.set_ups.wrong_setup import ELSEWHERE
 
@@ -45,3 +48,16 @@ def test_scatter_is_no_wrong_set_up_for_a_calibration(armpi, measured_armpi, mon
     monkeypatch.setattr(SeenRuns, "elsewhere", lambda _: told)
     said = _wrong_set_up(healthy_runs(armpi, measured_armpi), armpi)
     assert ("failuretwin doctor" in said) == bool(place)
+
+
+def test_what_was_learned_beside_joint_frames_counts_beside_them():
+    """Runs on the way of an arm whose tool is watched do not tell frames from zeros."""
+    ur5e = load_robot("ur5e")
+    found = ft.calibrate(healthy_runs(ur5e, generic_imperfections(ur5e), ENDLESS), ur5e)
+    assert found.imperfections.frames_in_doubt
+    assert has_geometry(ft.BayesDiagnoser(ur5e, found.imperfections).healthy_model)
+
+
+def test_a_path_that_is_computed_leaves_no_frame_in_doubt(armpi, measured_armpi):
+    found = ft.calibrate(healthy_runs(armpi, measured_armpi, ENDLESS), armpi)
+    assert not found.imperfections.frames_in_doubt

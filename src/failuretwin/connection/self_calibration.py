@@ -44,7 +44,7 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import poses_in_range
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.engine.theta import offsets_doubted
+from failuretwin.inference.engine.theta import has_geometry, offsets_doubted
 from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -257,6 +257,7 @@ def as_calibration(
             readings=_readings(found.model, runs),
             variation=_variation(found),
             of_class=False,
+            frames_in_doubt=has_geometry(found.model),
         ),
         parameters=tuple(parameters),
         sessions=tuple(dict.fromkeys(session_names(runs))),

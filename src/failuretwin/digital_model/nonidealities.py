@@ -149,6 +149,8 @@ class Imperfections:
         variation: Differences from run to run; None: the same robot in every run.
         sensors: Calibrated sensors in addition to the tool's position.
         of_class: Whether these are figures of a class of arms rather than of one robot.
+        frames_in_doubt: Whether the figures of one robot were learned beside joint frames that may
+            stand off its URDF, and do not count without them.
     """
 
     name: str
@@ -162,6 +164,7 @@ class Imperfections:
     variation: Variation | None = None
     sensors: tuple[SensorProfile, ...] = ()
     of_class: bool = False
+    frames_in_doubt: bool = False
 
     def __post_init__(self) -> None:
         if self.protocol not in PROTOCOLS:

@@ -18,7 +18,7 @@ from failuretwin.core.types import FloatArray
 from failuretwin.failure_behavior.mode import FaultMode
 from failuretwin.inference.engine.outcomes import Outcomes
 from failuretwin.inference.engine.rows import Drawn, Rows, Scene, sampled
-from failuretwin.inference.faults.priors import OnsetIntervals
+from failuretwin.inference.faults.priors import OnsetIntervals, shares_above
 
 NODES, DECADE = 16, 8
 """Nodes of the size on each side of zero, in a constant ratio: at least, and in a factor of 10."""
@@ -56,7 +56,8 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
     intervals = _intervals(scene)
     early = scene.priors.onset.before_run(mode.mode)
     onset = intervals.weights(early)
-    log_prior = np.concatenate([log_of(onset[:, :1]) + log_of(shares), log_of(onset[:, 1:])], 1)
+    of_run = shares_above(sizes, scene.off_on_the_way(motor))
+    log_prior = np.concatenate([log_of(onset[:, :1]) + log_of(of_run), log_of(onset[:, 1:])], 1)
     first = np.r_[np.zeros(len(shares), dtype=np.int64), np.arange(1, count)]
     runs, rows = log_prior.shape
     of_row = np.minimum(np.arange(rows), len(shares))

@@ -151,6 +151,16 @@ class Scene:
         del row
         return self.columns[run, moment, outcome]
 
+    def off_on_the_way(self, motor: int) -> FloatArray:
+        """Return what a healthy motor is off by on its way beside its scatter, (run,) [rad].
+
+        The median over the moments of a run; 0 at rest.
+        """
+        moments = self.moments
+        off = np.sqrt((moments.late + moments.bent)[:, :, 0, motor])
+        nothing = ~moments.usable.any(axis=1, keepdims=True)
+        return np.nanmedian(np.where(moments.usable | nothing, off, np.nan), axis=1)
+
     @property
     def settled(self) -> FloatArray:
         """Settled angles where every command arrives, (run, moment, motor) [rad]."""

@@ -280,10 +280,11 @@ def has_geometry(model: HealthyModel) -> bool:
     """Return whether joint frames are in doubt.
 
     They do not show where the path is computed from motor readings. What they leave of a robot that
-    was calibrated, or whose geometry was fitted, is in the scatter and the noise that were found.
+    was calibrated, or whose geometry was fitted, is in the scatter and the noise that were found,
+    unless these were found beside them.
     """
     shows = model.sensors.tool_alone and model.twin.robot.profile.sensor_pose != "log"
-    return shows and not model.is_calibrated
+    return shows and (not model.is_calibrated or model.imperfections.frames_in_doubt)
 
 
 def layout_of(model: HealthyModel, moving: bool = False) -> Layout:

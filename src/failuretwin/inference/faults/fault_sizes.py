@@ -46,10 +46,12 @@ class SizePrior:
     Attributes:
         ranges: Lowest and highest size of each.
         shares: How probable each range is; they sum to 1.
+        visible: Whether the ranges begin at what can be seen rather than where somebody said.
     """
 
     ranges: tuple[Range, ...]
     shares: tuple[float, ...]
+    visible: bool = False
 
     @classmethod
     def even(cls, ranges: Sequence[Range]) -> SizePrior:

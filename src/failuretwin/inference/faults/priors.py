@@ -312,7 +312,28 @@ def visible_sizes(mode: FaultMode, model: HealthyModel, motor: int, smaller: int
     tiny = WITHIN_A_DAY if below else 0.0
     shares = np.repeat([tiny / max(fewer, 1), (1.0 - tiny) / count], [fewer, count])
     ranges = tuple((low, WIDEST_ERROR * low) for low in (*below, *lows))
-    return SizePrior(ranges, tuple(shares.tolist()))
+    return SizePrior(ranges, tuple(shares.tolist()), visible=True)
+
+
+def shares_above(sizes: SizePrior, off_rad: FloatArray) -> FloatArray:
+    """Return the share of each range in runs whose motor is off by so much anyhow, (run, range).
+
+    Ranges that begin below `LEAST_ERROR` of it have `WITHIN_A_DAY` together: one moment shows too
+    little of them.
+
+    Args:
+        sizes: Sizes of the fault.
+        off_rad: Deviation of a healthy motor in one moment, (run,) [rad].
+    """
+    shares = np.tile(np.array(sizes.shares), (len(off_rad), 1))
+    lows = np.array([low for low, _ in sizes.ranges])
+    tiny = lows < LEAST_ERROR * off_rad[:, None]
+    total = np.sum(shares * tiny, axis=1, keepdims=True)
+    if not sizes.visible or not (total < 1.0).all():
+        return shares
+    left = np.minimum(total, WITHIN_A_DAY)
+    rest = shares * (1.0 - left) / (1.0 - total)
+    return np.where(tiny, shares * left / np.where(total > 0.0, total, 1.0), rest)
 
 
 def _of_a_day(model: HealthyModel, motor: int) -> float:
