@@ -198,10 +198,82 @@ def test_a_broken_table_is_explained(armpi, tmp_path, change, message):
 
 
 def test_a_csv_without_a_map_says_how_to_get_one(armpi, tmp_path):
-    write(tmp_path, pd.DataFrame({"t": [0.0]}))
+    write(tmp_path, pd.DataFrame({name: [0.0] for name in "tabcd"}))
 
     with pytest.raises(InputError, match=r"needs a column map.*--columns"):
         read_runs(tmp_path / "log.csv", armpi)
+
+
+JOINTS = ("cmd_waist", "cmd_shoulder", "cmd_elbow")
+
+
+def bench_arm(folder):
+    """An arm of three joints: waist, shoulder and elbow."""
+    links = "".join(f'<link name="l{k}"/>' for k in range(5))
+    joints = "".join(
+        f'<joint name="{name.removeprefix("cmd_")}" type="revolute"><parent link="l{k}"/>'
+        f'<child link="l{k + 1}"/><origin xyz="0.1 0.2 0.3"/><axis xyz="0 {k % 2} {1 - k % 2}"/>'
+        '<limit lower="-2" upper="2" effort="9" velocity="1"/></joint>'
+        for k, name in enumerate(JOINTS)
+    )
+    joints += (
+        '<joint name="flange" type="fixed"><parent link="l3"/><child link="l4"/>'
+        '<origin xyz="0.1 0.2 0.3"/></joint>'
+    )
+    (folder / "arm.urdf").write_text(f'<robot name="bench_arm">{links}{joints}</robot>')
+    profile = folder / "arm.toml"
+    profile.write_text(profile_text(check_urdf(folder / "arm.urdf"), profile))
+    return load_robot(profile)
+
+
+def commanded(folder, columns):
+    """Write a log with such columns of commands; return its path."""
+    time = np.arange(20) * 0.1
+    table = pd.DataFrame(dict.fromkeys(("time", *columns, "x", "y", "z"), time))
+    table.to_csv(folder / "log.csv", index=False)
+    return folder / "log.csv"
+
+
+def test_a_log_of_another_robot_than_the_default_asks_for_its_name(armpi, tmp_path):
+    message = (
+        r"too few columns of commands .* armpi_fpv \(4 motors\), the default where --robot names "
+        r"none\. .* 3 columns may be commands\. --robot NAME\|PROFILE names another"
+    )
+    with pytest.raises(InputError, match=message):
+        read_runs(commanded(tmp_path, JOINTS), armpi)
+
+
+def test_too_few_commands_are_no_matter_of_a_map(tmp_path):
+    log, robot = commanded(tmp_path, JOINTS[:2]), bench_arm(tmp_path)
+    message = r"no column map can mend that.*waist \(cmd_waist\).*elbow \(no column\)"
+    for read_or_draft in (read_runs, column_map_text):
+        with pytest.raises(InputError, match=message) as error:
+            read_or_draft(log, robot)
+        assert "--columns" not in str(error.value)
+
+
+def test_a_wrong_name_is_told_and_its_map_keeps_the_others(tmp_path):
+    log, robot = commanded(tmp_path, (*JOINTS[:2], "cmd_elbo")), bench_arm(tmp_path)
+    message = (
+        r"bench_arm \(3 motors\)\. Its joints: waist \(cmd_waist\), shoulder \(cmd_shoulder\), "
+        r"elbow \(no column\).*--columns"
+    )
+    with pytest.raises(InputError, match=message):
+        read_runs(log, robot)
+    draft = column_map_text(log, robot)
+    assert 'columns = ["cmd_waist", "cmd_shoulder", "FILL IN"]' in draft
+    (tmp_path / "map.toml").write_text(draft)
+    with pytest.raises(InputError, match=r"line \d+ is not filled in: columns = \[.*FILL IN"):
+        read_column_map(tmp_path / "map.toml", robot)
+    (tmp_path / "map.toml").write_text(draft.replace("FILL IN", "cmd_elbo"))
+    mapped = ReadOptions(columns=read_column_map(tmp_path / "map.toml", robot))
+    np.testing.assert_allclose(read_runs(log, robot, mapped)["command"][0, -1], 1.9, atol=1e-6)
+
+
+def test_readings_do_not_stand_in_for_commands_of_which_one_lacks(tmp_path):
+    columns = (*JOINTS[:2], *(name.removeprefix("cmd_") for name in JOINTS))
+    with pytest.raises(InputError, match=r"2 columns may be commands"):
+        read_runs(commanded(tmp_path, columns), bench_arm(tmp_path))
 
 
 # Columns that need no map: their names tell all.

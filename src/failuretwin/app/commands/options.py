@@ -14,6 +14,7 @@ from click.core import ParameterSource
 import failuretwin as ft
 from failuretwin.connection.links import NETWORKS
 from failuretwin.core.errors import InputError
+from failuretwin.digital_model.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -107,7 +108,7 @@ class RobotOptions:
 _robot_and_seed = (
     click.option(
         "--robot",
-        default="armpi_fpv",
+        default=DEFAULT_ROBOT,
         metavar="NAME|PROFILE",
         help="A bundled robot, or the TOML profile of another.",
     ),

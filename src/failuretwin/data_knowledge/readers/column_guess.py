@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, counted
 from failuretwin.core.runs import AXES
 from failuretwin.data_knowledge.readers.column_map import (
+    FILL_IN,
     SERVO,
     AngleColumns,
     ColumnMap,
@@ -26,7 +27,7 @@ from failuretwin.data_knowledge.readers.column_map import (
     map_text,
 )
 from failuretwin.data_knowledge.readers.table import Table, separator_of
-from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.robot import DEFAULT_ROBOT, Robot
 from failuretwin.digital_model.urdf.file import read_urdf
 
 COMMAND_WORDS = {"cmd", "command", "commanded", "target", "desired", "ref", "reference", "goal"}
@@ -52,28 +53,60 @@ def unambiguous_columns(path: Path, robot: Robot) -> ColumnMap:
     Raises:
         InputError: If they leave anything open; the text lists what, and the candidates.
     """
-    columns, _, doubts = _guess(path, robot)
-    if doubts:
+    guess = _guess(path, robot)
+    if guess.doubts:
         raise InputError(
             f"{path}: needs a column map, for the names of its columns leave open: "
-            f"{'; '.join(doubts)}. Add --columns MAP.toml: if that file does not exist yet, a "
-            "guess is written there for you to check."
+            f"{'; '.join(guess.doubts)}. {guess.commands_text(robot)}Add --columns MAP.toml: if "
+            "that file does not exist yet, a guess is written there for you to check."
         )
-    return columns
+    return guess.columns
 
 
-def _guess(path: Path, robot: Robot) -> tuple[ColumnMap, list[str], list[str]]:
+@dataclass(frozen=True)
+class _Guess:
+    """Column map that header and numbers of a CSV file suggest.
+
+    Attributes:
+        columns: The map, with `FILL_IN` for motors without a column.
+        names: Names of all columns.
+        commands: Columns that look like commands.
+        doubts: Open questions; none where the names answer all of them.
+    """
+
+    columns: ColumnMap
+    names: Sequence[str]
+    commands: Sequence[str]
+    doubts: Sequence[str]
+
+    def commands_text(self, robot: Robot) -> str:
+        """Return the column of each motor and the robot's name; empty if all have a column."""
+        told = self.columns.command.columns
+        if FILL_IN not in told:
+            return ""
+        found = ", ".join(
+            f"{motor.joint} ({'no column' if column == FILL_IN else column})"
+            for motor, column in zip(robot.motors, told, strict=True)
+        )
+        default = ", the default where --robot names none" if robot.name == DEFAULT_ROBOT else ""
+        return (
+            f"The robot was taken to be {robot.name} ({counted(len(told), 'motor')}){default}. "
+            f"Its joints: {found}. In this file {counted(len(self.commands), 'column')} may be "
+            "commands. --robot NAME|PROFILE names another robot. "
+        )
+
+
+def _guess(path: Path, robot: Robot) -> _Guess:
     """Return the column map that header and numbers of a CSV file suggest.
 
-    Returns:
-        The map, in which columns without a candidate are empty; names of all columns; and open
-        questions, none where the names answer all of them.
+    Raises:
+        InputError: If the file has fewer columns that may be commands than the robot has motors.
     """
     separator = separator_of(path)
     table = _Guessed.read(path, separator)
     found = _candidates(table.words, robot)
     first = {part: _firsts(candidates) for part, candidates in found.items()}
-    command, position, tool = first[COMMAND], first[READING], first[PLACE]
+    command, position, tool = _filled(found[COMMAND]), first[READING], first[PLACE]
     time = (*first[TIME], table.increasing())[0]
     turning = [_of_kind(columns, robot, False) for columns in (command, position)]
     sliding = [_of_kind(columns, robot, True) for columns in (command, position)]
@@ -97,7 +130,13 @@ def _guess(path: Path, robot: Robot) -> tuple[ColumnMap, list[str], list[str]]:
     doubts = [*_choices(found, robot), *_lacking(first, table.words)]
     doubts += [d for c in turning for d in table.unsaid(c, ANGLE_NAMES, LARGEST_RAD)]
     doubts += [d for c in (*sliding, tool) for d in table.unsaid(c, LENGTH_NAMES, LARGEST_M)]
-    return columns, list(table.words), doubts
+    guess = _Guess(columns, list(table.words), _command_columns(found, table.words), doubts)
+    if len(guess.commands) < len(command):
+        raise InputError(
+            f"{path}: has too few columns of commands for this robot, and no column map can mend "
+            f"that. {guess.commands_text(robot)}Otherwise log a command for each motor."
+        )
+    return guess
 
 
 class _Guessed(Table):
@@ -192,7 +231,7 @@ def _candidates(words: Mapping[str, set[str]], robot: Robot) -> Candidates:
     commands = {name: found for name, found in rest.items() if found & COMMAND_WORDS}
     readings = {name: found for name, found in rest.items() if name not in commands}
     command, reading = _by_motor(commands, robot), _by_motor(readings, robot)
-    if not _firsts(command):  # a log without words for commands: its only angles must be them
+    if not any(command):  # a log without words for commands: its only angles must be them
         command, reading = reading, []
     return {
         TIME: [time],
@@ -211,27 +250,31 @@ def _words(name: str) -> set[str]:
 
 
 def _by_motor(words: Mapping[str, set[str]], robot: Robot) -> list[list[str]]:
-    """Return the columns that may be each motor's: by joint or motor name, else by number.
+    """Return the columns that may be each motor's: by joint name, motor name or number.
+
+    The first of these three ways that finds a column for most motors counts.
 
     Numbers count the motors, or all joints that move between base and tool where there are as many
     of them. They begin at 0 if any column has a 0. Of names that hold one another, such as `lift`
     and `shoulder_lift`, the longest counts.
     """
     joints = {_plain(joint.name) for joint in read_urdf(robot.urdf_file).joints if joint.has_motor}
+    found = []
     for key in ("joint", "name"):
         named = [_plain(getattr(motor, key)) for motor in robot.motors]
         known = sorted(joints | set(named), key=len)
         owner = {n: [one for one in known if one in n.lower()][-1:] for n in words}
-        hits = [[name for name, of in owner.items() if of == [motor]] for motor in named]
-        if len(set(_firsts(hits))) == len(named):
-            return hits
-    numbers = {int(word) for found in words.values() for word in found if word.isdigit()}
+        found.append([[name for name, of in owner.items() if of == [motor]] for motor in named])
+    numbers = {int(word) for of in words.values() for word in of if word.isdigit()}
     start = 0 if 0 in numbers else 1
     count = next(k for k in range(len(numbers) + 1) if start + k not in numbers)
-    return [
-        [name for name, found in words.items() if str(start + place) in found]
-        for place in _places(robot, count)
-    ]
+    found.append(
+        [
+            [name for name, of in words.items() if str(start + place) in of]
+            for place in _places(robot, count)
+        ]
+    )
+    return max(found, key=lambda hits: len({name for name, *_ in filter(None, hits)}))
 
 
 def _plain(name: str) -> str:
@@ -240,7 +283,9 @@ def _plain(name: str) -> str:
 
 def _of_kind(columns: Sequence[str], robot: Robot, slides: bool) -> tuple[str, ...]:
     """Return the columns, one a motor if any, of those that slide, or of those that turn."""
-    return tuple(c for c, one in zip(columns, robot.slides, strict=False) if one == slides)
+    return tuple(
+        c for c, one in zip(columns, robot.slides, strict=False) if one == slides and c != FILL_IN
+    )
 
 
 def _places(robot: Robot, count: int) -> list[int]:
@@ -256,6 +301,22 @@ def _places(robot: Robot, count: int) -> list[int]:
 def _firsts(candidates: Sequence[Sequence[str]]) -> tuple[str, ...]:
     """Return the first candidate for each, or nothing where one has none."""
     return tuple(hits[0] for hits in candidates) if candidates and all(candidates) else ()
+
+
+def _filled(candidates: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """Return the first candidate for each, or `FILL_IN` where one has none."""
+    return tuple(hits[0] if hits else FILL_IN for hits in candidates)
+
+
+def _command_columns(found: Candidates, words: Mapping[str, set[str]]) -> list[str]:
+    """Return the columns that may be commands: those that are not taken for anything else."""
+    taken = {name for part in (TIME, RUN, PLACE, READING) for name in _firsts(found[part])}
+    taken |= {name for hits in found[DURATION] for name in hits}
+    return [
+        name
+        for name, of in words.items()
+        if name not in taken and (of & COMMAND_WORDS or not of & OTHER_WORDS)
+    ]
 
 
 def _choices(found: Candidates, robot: Robot) -> list[str]:
@@ -288,7 +349,6 @@ def _lacking(first: Mapping[str, Sequence[str]], words: Mapping[str, set[str]]) 
     return [f"{doubt}, of {', '.join(words)}" for doubt in doubts]
 
 
-FILL_IN = "FILL IN"
 HINTS = """\
 Columns of the file: {names}
 Motors of {robot}, in this order: {motors}
@@ -308,18 +368,14 @@ and columns = ["ax", "ay", "az"]."""
 
 def column_map_text(path: Path, robot: Robot) -> str:
     """Return a commented column map with the guess for a CSV file, ready to be corrected."""
-    columns, names, _ = _guess(path, robot)
-    count, time, command = len(robot.motors), columns.time, columns.command
+    guess, count = _guess(path, robot), len(robot.motors)
     hints = HINTS.format(
-        names=", ".join(names),
+        names=", ".join(guess.names),
         robot=robot.name,
         motors=", ".join(f"{motor.name} ({motor.joint})" for motor in robot.motors),
         sign=[-1] + [1] * (count - 1),
         zero=[0] * count,
     )
-    filled = replace(
-        columns,
-        time=replace(time, column=time.column or FILL_IN),
-        command=replace(command, columns=command.columns or (FILL_IN,) * count),
-    )
+    time = guess.columns.time
+    filled = replace(guess.columns, time=replace(time, column=time.column or FILL_IN))
     return map_text(f"Column map for {path.name}", hints, filled)

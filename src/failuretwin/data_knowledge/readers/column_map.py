@@ -29,6 +29,8 @@ SERVO = "servo"
 """Unit of angles in servo counts."""
 ISO = "iso"
 """Unit of times that are dates."""
+FILL_IN = "FILL IN"
+"""Entry of a guessed map that the user must replace with the name of a column."""
 CORRECTION = "correction"
 """Table of a column map that is not about columns: the correction of a wrong set-up."""
 
@@ -263,6 +265,7 @@ def read_column_map(path: Path, robot: Robot) -> ColumnMap:
         InputError: If the file is wrong or does not name what the robot needs.
     """
     table = {name: part for name, part in read_toml(path).items() if name != CORRECTION}
+    _check_filled(path)
     mapping = from_table(ColumnMap, table, str(path))
     if mapping.tool is None and mapping.position is None and not mapping.sensors:
         raise InputError(f"{path}: needs a [tool] table, or [position] to compute the path from.")
@@ -279,6 +282,16 @@ def read_column_map(path: Path, robot: Robot) -> ColumnMap:
         if angles is not None:
             angles.check_motors(robot, f"{path}: {name}")
     return mapping
+
+
+def _check_filled(path: Path) -> None:
+    """Raise InputError if a line of a map, comments aside, still holds `FILL_IN`."""
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        if f'"{FILL_IN}"' in line.partition("#")[0]:
+            raise InputError(
+                f"{path}: line {number} is not filled in: {line.strip()}. Replace each "
+                f'"{FILL_IN}" with the name of a column.'
+            )
 
 
 def check_entries(name: str, count: int, robot: Robot, where: str) -> None:
