@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+import failuretwin as ft
 from bag_writers import MONITORING, MONITORING_TEXT, entry, write_bag
 from failuretwin.connection.emulated_arm import EmulatedArm, Emulation, Shifts
 from failuretwin.connection.links import replay as pace
@@ -22,6 +23,7 @@ from failuretwin.connection.links.ros_link import RosSource
 from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.connection.links.ros_transport import Outgoing, RosCodec
 from failuretwin.connection.links.rosbridge import RosbridgeTransport
+from failuretwin.core.errors import InputError
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from fake_rosbridge import FakeRosbridge
 from little_logs import LOG_COLUMNS
@@ -165,6 +167,11 @@ def link(request, armpi, little_log, tmp_path):
     else:
         form = request.param.replace(" bag", "")
         yield replay(bag(little_log, tmp_path, form), armpi, Pace(0.0))
+
+
+def test_a_table_is_refused_with_what_a_user_can_do(armpi):
+    with pytest.raises(InputError, match=r"for `diagnose`.*to a bag, or .* ft\.Source .*live\.md"):
+        replay(ft.sample_log(), armpi, Pace(0.0))
 
 
 def fetch(source, count):

@@ -96,6 +96,13 @@ class PacedSource(Source):
         return None
 
 
+FOR_TABLES = (
+    "Run sets and tables are for `diagnose`. To watch one, convert it to a bag, or write an "
+    "ft.Source that feeds its rows (docs/tutorials/live.md shows one)."
+)
+"""What to do with a log that cannot be watched."""
+
+
 def replay(path: Path, robot: Robot, pace: Pace, topics: BagTopics | None = None) -> PacedSource:
     """Return a log as a source: one raw session (a folder), a ROS 1 or ROS 2 bag or an MCAP file.
 
@@ -111,7 +118,7 @@ def replay(path: Path, robot: Robot, pace: Pace, topics: BagTopics | None = None
     folders = find_sessions(path) if path.is_dir() else []
     if len(folders) != 1:
         found = f"holds {len(folders)} raw sessions" if folders else "is neither"
-        fix = "Name one of them." if folders else "Run sets and tables are for `diagnose`."
+        fix = "Name one of them." if folders else FOR_TABLES
         raise InputError(
             f"{path}: expected one raw session or a bag (.bag, .mcap, a folder of ROS 2), but it "
             f"{found}. {fix}"
