@@ -381,6 +381,7 @@ def test_a_robot_is_calibrated_again(failuretwin, two_days, small, armpi, tmp_pa
     answer = failuretwin("calibrate", two_days, "--out", path)
     assert answer.returncode == 0, answer.stderr
     assert read_calibration(path, armpi).runs < 99
+    assert f"use it with `failuretwin diagnose LOG --calibration {path}`" in answer.stdout
 
 
 def test_a_robot_has_its_own_calibration(failuretwin, learned, two_days, small, armpi, tmp_path):

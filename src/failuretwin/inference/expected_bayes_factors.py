@@ -240,6 +240,11 @@ class ExpectedLogBayesFactor:
             found[move] = self._fits_moving(runs.isel(run=move), [faults[i] for i in move.tolist()])
         return found
 
+    def hardly_rest(self, runs: xr.Dataset) -> bool:
+        """Return whether the healthy robot hardly rests in any of the runs."""
+        healthy = self.noise_free(runs, [[] for _ in range(runs.sizes["run"])])
+        return bool(hardly_rest(self._evidence(healthy), self.model).any())
+
     def _evidence(self, runs: xr.Dataset) -> Evidence:
         return Evidence(runs, self.model.settings, self.model.sensors)
 

@@ -213,6 +213,7 @@ class IsolabilityReport:
         typical: Size of each fault that `nats` and `groups` are of, by hypothesis, in the unit of
             the mode; of those that have a size.
         largest: Largest size that is considered, likewise.
+        on_the_way: Whether a motion hardly rests, so that moments on the way are compared.
     """
 
     hypotheses: tuple[str, ...]
@@ -222,6 +223,7 @@ class IsolabilityReport:
     isolated: Mapping[str, float | None]
     typical: Mapping[str, float]
     largest: Mapping[str, float]
+    on_the_way: bool = False
 
 
 def isolability(
@@ -274,6 +276,7 @@ def isolability(
         isolated={name: found[1] for name, found in smallest.items()},
         typical={str(h): _typical(*sizes) for h, sizes in sized.items()},
         largest={str(h): sizes[1] for h, sizes in sized.items()},
+        on_the_way=judge.hardly_rest(motions),
     )
 
 

@@ -274,7 +274,8 @@ def isolability(
         if motions is None
         else checking.isolability_in(motions)
     )
-    show(reports.size_table(found, model), *reports.group_lines(found, model))
+    remarks = [*reports.onset_lines(found), *reports.group_lines(found, model)]
+    show(reports.size_table(found, model), *remarks)
     write_json(reports.isolability_records(found), output.json_file)
     if output.report is not None:
         reports.save_picture(found, model, output.report)

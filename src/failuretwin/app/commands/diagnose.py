@@ -201,7 +201,7 @@ def diagnose(
     found.keep(None if keeper is None else keeper.latest)
     show(*reports.diagnosis_parts(diagnoses))
     if method == given.BAYES and sensed == TOOL_ALONE:
-        show(*isolability_summary(runs, found.bayes))
+        show(*isolability_summary(runs, found.bayes, robot.words))
     show(*reports.state_lines(state, together=course is not None))
     show(*reports.score_parts(diagnoses))
     last = [*reports.course_lines(course, state, known.robot), *found.lines]

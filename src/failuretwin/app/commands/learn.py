@@ -96,7 +96,8 @@ def calibrate(
     if stored is not None:
         tell(stored.keep_calibration(found))
     if found.beats_uncalibrated is not False:
-        tell(f"use it with `failuretwin diagnose --calibration {out}`")
+        options = replace(robot, calibration=out).words
+        tell(f"use it with `failuretwin diagnose LOG{options}`")
 
 
 def _wrong_set_up(runs: xr.Dataset, robot: ft.Robot) -> str:
@@ -133,8 +134,9 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str, robot: opt.Robot
     show(*population_parts(population.calibration, robot.model))
     tell(f"written to {out}")
     tell(
-        "use it for another robot of the kind with `failuretwin diagnose LOGS --self-calibrate "
-        f"--calibration {out} --out MINE.toml`, or without --self-calibrate for a single run"
+        "use it for another robot of the kind with `failuretwin diagnose LOGS --self-calibrate"
+        f"{replace(robot, calibration=out).words} --out MINE.toml`, or without --self-calibrate "
+        "for a single run"
     )
 
 

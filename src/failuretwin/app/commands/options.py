@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import wraps
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
@@ -103,6 +104,13 @@ class RobotOptions:
     def known(self) -> CalibratedRobot:
         """The robot with its servo loops and healthy behaviour."""
         return ft.load_calibration(self.calibration, self.robot)
+
+    @property
+    def words(self) -> str:
+        """Options as typed in a command, each after a blank; empty where none was named."""
+        robot = "" if self.robot == DEFAULT_ROBOT else f" --robot {quote(self.robot)}"
+        file = self.calibration
+        return robot + ("" if file is None else f" --calibration {quote(str(file))}")
 
 
 _robot_and_seed = (

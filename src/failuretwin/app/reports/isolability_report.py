@@ -140,12 +140,20 @@ MAX_COMPARED = 16
 """Maximum number of hypotheses; comparing more takes longer than the diagnosis."""
 WITHOUT_RESTS = (
     "which faults motions without rests tell apart takes longer to work out than the diagnosis: "
-    "run `failuretwin isolability --motions LOG`"
+    "run `failuretwin isolability --motions LOG{options}`"
 )
 
 
-def isolability_summary(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str]:
-    """Return which faults such motions cannot tell apart, and the smallest that they show."""
+def isolability_summary(
+    runs: xr.Dataset, diagnoser: BayesDiagnoser, options: str = ""
+) -> list[str]:
+    """Return which faults such motions cannot tell apart, and the smallest that they show.
+
+    Args:
+        runs: Runs with these motions.
+        diagnoser: Diagnoser of the runs.
+        options: Options of the robot in a command that is named.
+    """
     single = [h for h in diagnoser.hypothesis_set if h.known and len(h.faults) <= 1]
     left_out = _left_out_lines([h for h in diagnoser.hypothesis_set if h not in single])
     if not any(h.faults for h in single):
@@ -165,7 +173,7 @@ def isolability_summary(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str
     if not settled.usable.any():
         return left_out
     if settled.on_the_way.all():
-        return [WITHOUT_RESTS, *left_out]
+        return [WITHOUT_RESTS.format(options=options), *left_out]
     found = isolability(
         diagnoser.twin,
         command[some],
@@ -199,6 +207,15 @@ def group_lines(found: IsolabilityReport, robot: Robot) -> list[str]:
     sized = any(name in found.typical for group in found.groups for name in group)
     when = " when faults are as large as this" if sized else ""
     return [f"cannot be told apart by such motions{when}: {'; '.join(groups)}"]
+
+
+def onset_lines(found: IsolabilityReport) -> list[str]:
+    """Return the onset that the sizes assume; empty unless a motion has no rests."""
+    line = (
+        "motions without rests: the sizes are for errors that are there from the start; an error "
+        "that begins in mid-run shows from smaller sizes on"
+    )
+    return [line] * found.on_the_way
 
 
 def size_lines(found: IsolabilityReport, robot: Robot) -> list[str]:
