@@ -1,11 +1,14 @@
 """Curves that a log states seldom, joined by lines: no verdict, and no long search."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
 import failuretwin as ft
-from failuretwin.app.reports.isolability_report import isolability_summary
+from failuretwin.app.commands.options import RobotOptions
+from failuretwin.app.reports.isolability_report import isolability_summary, onset_lines
 from failuretwin.digital_model.robot import load_robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.set_up_weighing import SetUpWeighing
@@ -50,11 +53,25 @@ def test_curves_told_seldom_are_undecided_without_a_search(fault, every_s, tmp_p
     monkeypatch.setattr(SetUpWeighing, "searched", None)
     (found,) = ft.diagnose(runs, ROBOT, "generic")
     assert found.diagnosis is None
-    assert "commands too far apart" in found.verdict
+    assert "commands are too far apart" in found.verdict
+    assert "readings" not in found.verdict
+    assert found.explanation == ("Log again, with commands at 10 Hz or more.",)
     assert isolability_summary(runs, ft.BayesDiagnoser(ROBOT, "generic")) == []
 
 
 def test_for_curves_the_command_is_named_that_works_out_what_they_tell_apart(tmp_path):
     runs = logged(tmp_path, curve(12.0), curve(12.0), 0.04)
-    (line,) = isolability_summary(runs, ft.BayesDiagnoser(ROBOT, "generic"))
-    assert "`failuretwin isolability --motions LOG`" in line
+    options = RobotOptions("my arm.toml", seed=0, calibration=Path("cal.toml")).words
+    (line,) = isolability_summary(runs, ft.BayesDiagnoser(ROBOT, "generic"), options)
+    command = "isolability --motions LOG --robot 'my arm.toml' --calibration cal.toml`"
+    assert f"`failuretwin {command}" in line
+    assert RobotOptions("armpi_fpv", seed=0).words == ""
+
+
+def test_sizes_of_motions_without_rests_are_of_errors_from_the_start():
+    time = STEP_S * np.arange(601)
+    rests = np.outer(np.clip(time - 1.0, 0.0, 1.0), [0.5, -0.4, 0.3, 0.2])
+    for command, count in ((curve(6.0), 1), (rests, 0)):
+        found = ft.isolability(ROBOT, command, time, "generic", ["motor_2:stuck"])
+        assert found.on_the_way == bool(count)
+        assert len(onset_lines(found)) == count

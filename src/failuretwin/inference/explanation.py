@@ -31,6 +31,7 @@ from failuretwin.inference.advice import (
     next_steps,
     rests_on_one_movement,
 )
+from failuretwin.inference.observation.between_commands import TOO_SELDOM
 from failuretwin.inference.set_ups.wrong_setup import DOUBTS, NOWHERE
 
 TELLING_NATS = 1.0
@@ -221,6 +222,8 @@ def undecided_step(reason: str) -> str:
     """Return what to do about a run that allows no verdict, for this reason."""
     if NOWHERE in reason:
         return WRONG_SETUP_ADVICE
+    if reason == TOO_SELDOM:
+        return "Log again, with commands at 10 Hz or more."
     return "Log again, for five movements or more, with the tool in view while it rests."
 
 

@@ -239,8 +239,8 @@ def abstention_reason(
 
 
 NEVER_AT_REST = (
-    "the tool is not seen at rest after any movement, and on its way it cannot be compared with "
-    "the commands: too few readings, or commands too far apart in time"
+    "the tool is not seen at rest after any movement, and too few readings on its way can be "
+    "compared with the commands"
 )
 """Why a run without a usable movement allows no verdict."""
 LEVELS = (0.05, 0.5, 0.95)

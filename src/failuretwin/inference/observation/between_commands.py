@@ -22,6 +22,11 @@ from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.lag_offset import command_at
 
+TOO_SELDOM = (
+    "the tool is not seen at rest after any movement, and the commands are too far apart in time "
+    "to tell its way between them"
+)
+"""Why such a run allows no verdict."""
 STRAYS = 1.4
 """Factor by which the tool is further off between corners than at them."""
 SEEN = 2.0
