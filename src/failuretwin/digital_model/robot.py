@@ -27,9 +27,6 @@ from failuretwin.digital_model.profile import Motor, Profile
 from failuretwin.digital_model.servo import ServoUnits
 from failuretwin.digital_model.urdf.file import read_urdf
 
-DEFAULT_ROBOT = "armpi_fpv"
-"""Robot of logs and commands that name none."""
-
 
 @dataclass(frozen=True)
 class Robot:

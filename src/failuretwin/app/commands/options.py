@@ -15,7 +15,7 @@ from click.core import ParameterSource
 import failuretwin as ft
 from failuretwin.connection.links import NETWORKS
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.robot import DEFAULT_ROBOT
+from failuretwin.digital_model import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -27,7 +27,8 @@ from failuretwin.data_knowledge.readers.column_map import (
     map_text,
 )
 from failuretwin.data_knowledge.readers.table import Table, separator_of
-from failuretwin.digital_model.robot import DEFAULT_ROBOT, Robot
+from failuretwin.digital_model import DEFAULT_ROBOT
+from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.urdf.file import read_urdf
 
 COMMAND_WORDS = {"cmd", "command", "commanded", "target", "desired", "ref", "reference", "goal"}
