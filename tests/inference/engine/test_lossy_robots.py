@@ -56,7 +56,7 @@ def test_shares_of_outcomes_say_what_other_weights_say(name, movements):
     lossy = np.sum(expected * np.exp(other - exact), axis=1)
     assert lossy.min() < share < 0.5 < lossy.max()  # some runs lose commands, some do not
     off = np.abs(np.sum(found * both.lossy, axis=1) - lossy)
-    assert np.quantile(off, 0.75) < 0.1  # with a stuck motor a lost command may count twice
+    assert np.median(off) < 0.03  # with a stuck motor a lost command may count twice
 
 
 def test_a_robot_that_loses_many_commands_is_told_so():

@@ -339,10 +339,12 @@ def narrowed(
     place = np.full(rows.log_prior.shape, -1)
     place[run, row] = np.arange(len(run))
     share = _of_movements(share, _kept(scene, rows, picks) > 0.0)
-    order = np.argsort(-share, axis=-1, kind="stable")
+    arrives = np.isfinite(rows.log_weight[run, row, :, 0])
+    order, others = _likeliest_first(share, arrives)
     left = 1.0 - np.cumsum(np.take_along_axis(share, order, axis=-1), axis=-1)
     total = share.sum(axis=-1, keepdims=True)
     count = 1 + (left - (1.0 - total) > LEFT_OUT * total).sum(axis=-1)  # (pick, moment)
+    count = np.maximum(count, 1 + others)
     kept = order[..., : count.max(initial=1)]
     moment = np.arange(share.shape[1])[None, :, None]
     some = run[:, None, None]
@@ -365,6 +367,22 @@ def narrowed(
         np.stack(covariance),
     )
     return Prepared(_contiguous(tables), place, place, G[:, :, 0], kept)
+
+
+def _likeliest_first(share: FloatArray, arrives: BoolArray) -> tuple[IntArray, BoolArray]:
+    """Return outcomes by their share, (pick, moment, outcome), and where the likeliest is a loss.
+
+    There all commands arrive in the second: robots that scatter more may need no loss.
+
+    Args:
+        share: Share of each outcome, (pick, moment, outcome).
+        arrives: Whether all commands may arrive, (pick, moment).
+    """
+    best = share.argmax(axis=-1)
+    lost, height = arrives & (best != 0), share.copy()
+    np.put_along_axis(height, best[..., None], 3.0, axis=-1)
+    height[..., 0] = np.where(lost, 2.0, height[..., 0])
+    return np.argsort(-height, axis=-1, kind="stable"), lost
 
 
 def _kept(scene: Scene, rows: Rows, picks: Picks) -> FloatArray:

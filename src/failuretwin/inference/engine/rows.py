@@ -154,9 +154,12 @@ class Scene:
     def off_on_the_way(self, motor: int) -> FloatArray:
         """Return what a healthy motor is off by on its way beside its scatter, (run,) [rad].
 
-        The median over the moments of a run; 0 at rest.
+        The median over the moments of a run; 0 at rest, and of a robot of which its class alone is
+        known.
         """
         moments = self.moments
+        if not self.model.is_calibrated:
+            return np.zeros(moments.runs)
         off = np.sqrt((moments.late + moments.bent)[:, :, 0, motor])
         nothing = ~moments.usable.any(axis=1, keepdims=True)
         return np.nanmedian(np.where(moments.usable | nothing, off, np.nan), axis=1)
