@@ -25,6 +25,8 @@ LOCAL = frozenset({"127.0.0.1", "localhost", "::1"})
 """Names of this computer."""
 BEAT_S = 0.25
 """Time between two signs that the server works [s]."""
+GOODBYE_S = 5
+"""How long connections have to end once the console does [s]."""
 PATIENCE_S = 10.0
 """Time that a page may be silent, such as while it draws, before it counts as closed [s]."""
 LARGEST_MESSAGE = 1024 * 1024
@@ -98,6 +100,7 @@ def serve(desk: Desk, listening: Listening) -> None:
         message_history_length=200,
         reconnect_timeout=PATIENCE_S,
         ws_max_size=LARGEST_MESSAGE,
+        timeout_graceful_shutdown=GOODBYE_S,
         server_header=False,
     )
 
