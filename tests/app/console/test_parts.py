@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
@@ -31,6 +31,7 @@ from failuretwin.app.console.live import LiveRobot, LiveSettings
 from failuretwin.connection.links.base import Order, Reading
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.data_knowledge.readers.read import read_runs
 from failuretwin.data_knowledge.records.overview import RobotGlance
 from failuretwin.data_knowledge.records.store import open_store
 from failuretwin.decision.acting.work import Halted
@@ -39,6 +40,16 @@ from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 from failuretwin.inference.advice import NOTHING_TO_DO
 
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
+
+
+def test_the_end_waits_for_the_logs_that_the_demo_writes(armpi, tmp_path):
+    # cut off, the thread keeps HDF5's lock, and the interpreter never ends
+    with ExitStack() as stack:
+        store = demo.demo_store(tmp_path, calibrated(armpi), stack)
+    assert set(demo.LOGS) <= {one.robot for one in store.overview()}
+    for logs in demo.LOGS.values():
+        for name, _ in logs:
+            assert read_runs(tmp_path / f"{name}.nc", armpi).sizes["run"] == 1
 
 
 def glance(days=1.0, verdict_state="healthy", faults=None, remarks=()):

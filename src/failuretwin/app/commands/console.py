@@ -155,7 +155,7 @@ def _begin_demo(
 
     if store is not None:
         raise InputError("--demo has a store of its own. Leave out --store.")
-    store = demo.demo_store(folder, known)
+    store = demo.demo_store(folder, known, stack)
     arms |= demo.demo_arms(store, known, speed)
     if robots:
         writer = demo.HistoryWriter(store, folder, known, robots)

@@ -55,10 +55,16 @@ REVERSED = {"hall_2-arm_8": 1}
 """Robots whose set-up is wrong: the number of the motor whose commands have the other sign."""
 
 
-def demo_store(folder: Path, known: CalibratedRobot) -> Store:
-    """Return a store that a thread fills with robots whose logs are in the folder."""
+def demo_store(folder: Path, known: CalibratedRobot, stack: ExitStack) -> Store:
+    """Return a store that a thread fills with robots whose logs are in the folder.
+
+    The stack waits for the thread: cut while it writes, it would keep the lock of HDF5, for which
+    the end of the interpreter waits.
+    """
     store = open_store(folder / "robots.db", create=True)
-    Thread(target=_write_logs, args=(store, folder, known), name="logs", daemon=True).start()
+    thread = Thread(target=_write_logs, args=(store, folder, known), name="logs", daemon=True)
+    thread.start()
+    stack.callback(thread.join)
     return store
 
 
@@ -104,15 +110,19 @@ class HistoryWriter:
     _process: subprocess.Popen[bytes] | None = None
     _stopped: bool = False
 
+    def __post_init__(self) -> None:
+        self._thread = Thread(target=self._write, name="history", daemon=True)
+
     def start(self) -> None:
         """Begin to write."""
-        Thread(target=self._write, name="history", daemon=True).start()
+        self._thread.start()
 
     def stop(self) -> None:
-        """End the process that writes."""
+        """End the process that writes, and wait for the thread, as for that of the logs."""
         self._stopped = True
         if self._process is not None:
             self._process.terminate()
+        self._thread.join()
 
     def _write(self) -> None:
         stored = ["--store", self.store.name]
@@ -141,6 +151,8 @@ class HistoryWriter:
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=quiet, stderr=quiet)
         os.setpriority(os.PRIO_PROCESS, self._process.pid, LOW_PRIORITY)
+        if self._stopped:  # meanwhile
+            self._process.terminate()
         self._process.wait()
 
 
