@@ -135,6 +135,7 @@ def live(
         end=begin + JUST_AFTER_S,
         first_reading_delay=chance.late + READ_S,
         arrived=arrived,
+        too_seldom=np.zeros(len(usable), dtype=bool),
     )
     hours = (told.start[:, -1] - told.start[:, 0]) / 3600.0
     period = np.median(np.diff(told.start, axis=1), axis=1)

@@ -52,6 +52,7 @@ def seen(model, off, usable=(True, True, True, True), lost=()):
         end=at + 1.9,
         first_reading_delay=np.zeros((1, count)),
         arrived=np.full((1, count, 4), np.nan),
+        too_seldom=np.zeros(1, dtype=bool),
     )
 
 

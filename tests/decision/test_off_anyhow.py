@@ -137,6 +137,7 @@ def of_points(likelihood, points):
         one * likelihood.evidence.end,
         one * likelihood.evidence.first_reading_delay,
         np.repeat(likelihood.evidence.arrived, count, axis=0),
+        np.zeros(count, dtype=bool),
     )
     return RunLikelihood(evidence, likelihood.model)
 

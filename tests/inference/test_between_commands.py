@@ -9,6 +9,8 @@ from scipy.interpolate import CubicSpline
 import failuretwin as ft
 from failuretwin.app.commands.options import RobotOptions
 from failuretwin.app.reports.isolability_report import isolability_summary, onset_lines
+from failuretwin.connection.tracked_diagnosis import History, begin, diagnose_tracked
+from failuretwin.core.runs import concatenate
 from failuretwin.digital_model.robot import load_robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.set_up_weighing import SetUpWeighing
@@ -18,11 +20,11 @@ TOOL = ("tool_x_m", "tool_y_m", "tool_z_m")
 STEP_S = 0.01
 
 
-def curve(seconds):
+def curve(seconds, seed=7):
     """A smooth curve through random points."""
     time = STEP_S * np.arange(round(seconds / STEP_S) + 1)
     at = np.arange(0.0, seconds + 1.0, 0.9)
-    points = np.random.default_rng(7).uniform(-0.7, 0.7, (len(at), 4))
+    points = np.random.default_rng(seed).uniform(-0.7, 0.7, (len(at), 4))
     return CubicSpline(at, points)(time)
 
 
@@ -57,6 +59,26 @@ def test_curves_told_seldom_are_undecided_without_a_search(fault, every_s, tmp_p
     assert "readings" not in found.verdict
     assert found.explanation == ("Log again, with commands at 10 Hz or more.",)
     assert isolability_summary(runs, ft.BayesDiagnoser(ROBOT, "generic")) == []
+
+
+@pytest.mark.parametrize("together", ["as a folder", "as a life"])
+def test_runs_told_seldom_are_undecided_together_too(together, tmp_path):
+    parts = []
+    for number in range(2):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        way = curve(12.0, seed=number)
+        parts.append(logged(folder, way, way, 1.0).assign_coords(run=[f"run {number}"]))
+    runs = concatenate(parts)
+    if together == "as a folder":
+        found = ft.SelfCalibratingDiagnoser(ROBOT).diagnose(runs)
+    else:
+        diagnoser = ft.BayesDiagnoser(ROBOT, "generic")
+        found = diagnose_tracked(runs, diagnoser, History(begin(diagnoser, True), True)).diagnoses
+    assert [one.diagnosis for one in found] == [None, None]
+    for one in found:
+        assert "commands are too far apart" in one.verdict
+        assert one.explanation == ("Log again, with commands at 10 Hz or more.",)
 
 
 def test_for_curves_the_command_is_named_that_works_out_what_they_tell_apart(tmp_path):

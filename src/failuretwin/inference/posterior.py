@@ -50,6 +50,7 @@ from failuretwin.inference.faults.stuck import stuck_model
 from failuretwin.inference.faults.unknown import unknown_likelihood
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.movements.two_joint_likelihood import two_joint_likelihood
+from failuretwin.inference.observation.between_commands import TOO_SELDOM
 from failuretwin.inference.observation.evidence import SettledEvidence, unused_movements
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.log_quality import (
@@ -224,7 +225,7 @@ def abstention_reason(
     if not evidence.movements.exists[run].any():
         return "no motor is told to move"
     if not usable.any():
-        return NEVER_AT_REST
+        return TOO_SELDOM if evidence.too_seldom[run] else NEVER_AT_REST
     if usable.sum() <= FEW_MOVEMENTS and probability < 0.5:
         count = int(usable.sum())
         return f"only {counted(count, 'movement')} can be used and no hypothesis stands out"

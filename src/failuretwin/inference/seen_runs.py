@@ -16,14 +16,13 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import BoolArray, IntArray, as_floats
+from failuretwin.core.types import IntArray, as_floats
 from failuretwin.inference.engine.registration import robot_parts, run_posterior, sensor_in_doubt
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.engine.weighing import ALLOWED_FOR, Weighing
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import FITS, run_misfit
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
-from failuretwin.inference.observation.between_commands import TOO_SELDOM
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.on_the_way import (
@@ -99,19 +98,15 @@ class SeenRuns:
         sound = self.evidence.sound
         if not sound.settled.usable.shape[1]:
             return sound.settled.padded(1)
-        if not self.whole_run:
-            return sound.settled
-        return on_the_way(sound, self.model, self._judges.lag_s)
+        told = sound, self.model, self._judges.lag_s
+        if self.whole_run:
+            return on_the_way(*told)
+        return replace(sound.settled, too_seldom=told_too_seldom(*told))
 
     @cached_property
     def lag_s(self) -> float:
         """How far the tool trails its commands in runs that hardly rest [s]."""
         return likeliest_lag(self.evidence.sound, self.model)
-
-    @cached_property
-    def too_seldom(self) -> BoolArray:
-        """Which runs have commands too far apart to tell the way between them, (run,)."""
-        return told_too_seldom(self.evidence.sound, self.model, self._judges.lag_s)
 
     @cached_property
     def healthy(self) -> HealthyModel:
@@ -188,7 +183,7 @@ class SeenRuns:
             thorough: Whether all set-ups are weighed, also where the one as told fits.
         """
         told = SetUpWeighing(self.sample, self.hypotheses, self.priors)
-        if told.rate == 0.0 or not self.model.sensors.tool_alone or self.too_seldom.all():
+        if told.rate == 0.0 or not self.model.sensors.tool_alone or self.settled.too_seldom.all():
             return told.taken_as_told()  # what happens to be seen of such ways is no set-up
         first, seen = told.as_told, self
         for look in (SeenRuns.unit, SeenRuns.clock):
@@ -244,12 +239,7 @@ class SeenRuns:
         judged = self.judges is None and np.array_equal(some, self.sampled)
         known = self.weighed_sample if judged else ()
         in_doubt = self._judges.in_doubt
-        found = run_posterior(likelihood, self.hypotheses, self.priors, in_doubt, known)
-        unseen = ~likelihood.usable.any(axis=1)
-        if not unseen.any():
-            return found
-        lost = unseen & self.too_seldom[some]
-        return replace(found, no_verdict=[TOO_SELDOM if one else "" for one in lost])
+        return run_posterior(likelihood, self.hypotheses, self.priors, in_doubt, known)
 
     def robots(self, named: Posterior, common: Sequence[str], others: bool) -> RobotMixture:
         """Return what runs say of the robot: that of the model, or another of its kind.
@@ -314,9 +304,7 @@ def mixed(
         return likeliest
     everywhere = bool(set_ups.best.set_up.what)
     lost = [_unexplained(likeliest, run, known[run], everywhere) for run in range(count)]
-    reasons = likeliest.no_verdict or [""] * count
-    either = [ANOTHER if one else why for one, why in zip(lost, reasons, strict=True)]
-    return replace(likeliest, no_verdict=either)
+    return replace(likeliest, no_verdict=[ANOTHER if one else "" for one in lost])
 
 
 def common_remarks(set_ups: SetUpPosterior, rounding: Sequence[str]) -> list[str]:

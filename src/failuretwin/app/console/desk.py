@@ -245,7 +245,7 @@ class Desk:
 
     def last_diagnosis(self, name: str) -> Diagnosis | None:
         """Return the last diagnosis of a robot in the store, without its evidence; None: none."""
-        glance, runs = self._glance(name), self.stored_runs(name)
+        glance, runs = self.glance(name), self.stored_runs(name)
         if glance is None or not runs:
             return None
         undecided, *quality = glance.remarks or ("",)
@@ -253,15 +253,16 @@ class Desk:
 
     def open_faults(self, name: str) -> list[str]:
         """Return the faults of the open episodes of a robot in the store, ``MOTOR:MODE``."""
-        glance = self._glance(name)
+        glance = self.glance(name)
         return [] if glance is None else list(glance.faults)
 
     def open_episodes(self, name: str) -> list[FaultEpisode]:
         """Return the open episodes of a robot in the store."""
-        store = self.store if self._glance(name) is not None else None
+        store = self.store if self.glance(name) is not None else None
         return [] if store is None else store.history(name).open_episodes
 
-    def _glance(self, name: str) -> RobotGlance | None:
+    def glance(self, name: str) -> RobotGlance | None:
+        """Return what the store last said of a robot; None: it does not know it."""
         return next((one for one in self._glances if one.robot == name), None)
 
     def stored_trace(self, name: str, row: int) -> Trace:

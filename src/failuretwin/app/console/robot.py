@@ -13,7 +13,7 @@ from failuretwin.app.console import draw, parts, texts
 from failuretwin.app.console import state as shown
 from failuretwin.app.console.arm import ArmScene
 from failuretwin.app.console.charts import Charts
-from failuretwin.app.console.desk import has_log
+from failuretwin.app.console.desk import LOOK_S, has_log
 from failuretwin.app.console.layout import Visit, page
 from failuretwin.app.console.live import STATES, LiveRobot
 from failuretwin.app.console.state import LiveView, Tile
@@ -55,16 +55,42 @@ def show(visit: Visit, name: str) -> None:
         robot = None if known is None else known.robot
         if live is not None:
             LivePage(visit, live)
-        else:
-            draw.badges(tile.states)
-            draw.text(visit.words(tile.said, robot))
-            draw.text(visit.time(tile.heard)).classes("soft")
-            _stored_arm(visit, tile, known)
-        _runs(visit, name, robot)
+        StoredPage(visit, name, known)
         if known is not None:
             ReachPart(visit, known, *_held_now(visit, name, known.robot))
         life = texts.LIFE, texts.ASK_LIFE
         parts.asked(visit, robot, life, lambda: desk.remaining_life(name), texts.LIFE_NOTE)
+
+
+class StoredPage:
+    """The part of a page that tells what is stored of a robot, drawn anew when that changes."""
+
+    def __init__(self, visit: Visit, name: str, known: CalibratedRobot | None) -> None:
+        self._visit, self._name, self._known = visit, name, known
+        self._drawn: object = None
+        self._place = ui.element("div")
+        self._look()
+        ui.timer(LOOK_S, self._look)
+
+    def _look(self) -> None:
+        desk, known = self._visit.desk, self._known
+        live, tile = desk.live.get(self._name), desk.tile(self._name)
+        if tile is None:
+            return
+        state = (tile.state, tile.mode) if live is None else ()
+        told = desk.glance(self._name), state
+        if told == self._drawn:
+            return
+        self._drawn = told
+        self._place.clear()
+        with self._place:
+            robot = None if known is None else known.robot
+            if live is None:
+                draw.badges(tile.states)
+                draw.text(self._visit.words(tile.said, robot))
+                draw.text(self._visit.time(tile.heard)).classes("soft")
+                _stored_arm(self._visit, tile, known)
+            _runs(self._visit, self._name, robot)
 
 
 def _stored_arm(visit: Visit, tile: Tile, known: CalibratedRobot | None) -> None:

@@ -194,6 +194,7 @@ def settled_evidence_of(windows: Sequence[Sequence[Seen]]) -> SettledEvidence:
         end=rest - zero,
         first_reading_delay=np.full(start.shape, np.nan),
         arrived=np.full(movements.target.shape, np.nan),
+        too_seldom=np.zeros(len(usable), dtype=bool),
     )
 
 

@@ -176,6 +176,8 @@ class SettledEvidence(ArrayStruct):
             [s]; NaN where there is none or where straight lines fill the gaps between readings.
         arrived: Whether each motor reports to have received the command, (run, movement, motor);
             NaN where it does not tell.
+        too_seldom: Runs that hardly rest, whose commands are too far apart to tell the way between
+            them, (run,).
     """
 
     movements: Movements
@@ -186,6 +188,7 @@ class SettledEvidence(ArrayStruct):
     end: PerMovement
     first_reading_delay: PerMovement
     arrived: Annotated[FloatArray, Axes("run", "movement", "motor", empty=np.nan)]
+    too_seldom: Annotated[BoolArray, Axes("run", empty=False)]
 
     @property
     def transient_until(self) -> FloatArray:

@@ -142,7 +142,8 @@ def on_the_way(evidence: Evidence, model: HealthyModel, lag_s: float) -> Settled
     hardly = hardly_rest(evidence, model) & ~strays
     unseen = settled.movements.exists & ~settled.usable & _few_rests(evidence, model)[:, None]
     unseen = (unseen | curves) & hardly[:, None]
-    settled = replace(settled, usable=settled.usable & ~(curves & strays[:, None]))
+    seen = settled.usable & ~(curves & strays[:, None])
+    settled = replace(settled, usable=seen, too_seldom=strays)
     if not unseen.any():
         return settled
     looks = _Looks(evidence, model, lag_s)
