@@ -136,6 +136,24 @@ def test_a_motor_that_stops_on_a_curve_is_found_where_the_tool_rests_behind_it()
     assert found.onset_90[0] <= 3.5 <= found.onset_90[1]
 
 
+@pytest.mark.parametrize(("motor", "error", "at"), [(0, 0.15, 310), (1, -0.2, 420), (2, 0.2, 350)])
+def test_an_error_that_comes_on_a_curve_and_stays_is_sized_and_dated(motor, error, at):
+    """Taken for another zero of its motor, it would seem there from the start, at half its size."""
+    command = curve()
+    off, runs = command.copy(), exact_run(command, 0.0)
+    off[at:, motor] += error
+    seen = np.full((len(command), 3), np.nan)
+    seen[::10] = DigitalTwin(ROBOT).path(off[::10])
+    (found,) = ft.diagnose(
+        runs.assign(measured=(runs["measured"].dims, seen[None])), ROBOT, "generic"
+    )
+    assert str(found.diagnosis) == f"motor_{motor + 1}:steady_state_error"
+    assert found.magnitude_90[0] <= abs(error) <= found.magnitude_90[1]
+    assert found.magnitude == pytest.approx(abs(error), rel=0.1)
+    assert found.onset_90[0] <= STEP_S * at <= found.onset_90[1]
+    assert found.onset_90[1] - found.onset_90[0] < 1.2
+
+
 def test_a_motor_that_follows_later_is_found_and_timed():
     command, time = curve(), STEP_S * np.arange(len(curve()))
     late = command.copy()

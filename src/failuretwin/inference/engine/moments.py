@@ -91,6 +91,11 @@ class Moments:
         return replace(self, base=self.base - self.speed * lag_s)
 
     @property
+    def on_curves(self) -> BoolArray:
+        """Which moments follow another on the same curve, (run, moment)."""
+        return (self.kept > 0.0) & (self.kept < 1.0)
+
+    @property
     def runs(self) -> int:
         """How many runs."""
         return len(self.usable)

@@ -48,23 +48,65 @@ def offset_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
     late = mode.signature is Signature.TRANSIENT
     angle = _late_angle(scene, motor, mode) if late else _offset_angle(scene, motor, mode, since)
     moving = MovedMotor(scene, motor, False, angle, first)
+    best = _best_sizes(moving, sizes, mode.signed, alike=not growing)
+    return moving.rows(*best, log_prior, _size_prior(sizes, mode.signed), sampled(onsets, shares))
+
+
+def constant_rows(scene: Scene, motor: int, sizes: SizePrior, early: float) -> Rows:
+    """Return the rows of an error of either sign that begins in the run and stays as it is.
+
+    One that was there before is nothing but another zero of its motor.
+
+    Args:
+        scene: The runs.
+        motor: Index of the motor.
+        sizes: Sizes of the error [rad].
+        early: Probability that it was there before the run.
+    """
+    moments, intervals = scene.moments, moment_intervals(scene)
+
+    def angle(x: FloatArray, outcome: IntArray) -> FloatArray:
+        settled = taken(scene.pose, outcome)[..., motor, None]
+        return settled + x[:, :, None] * moments.done[:, None, :, motor, None]
+
+    moving = MovedMotor(scene, motor, False, angle, np.arange(1, moments.count))
+    onset, share = intervals.samples(early)
+    onsets = sampled(onset[:, 1:], share[:, 1:])
+    log_prior = log_of(intervals.weights(early)[:, 1:])
+    best = _best_sizes(moving, sizes, signed=True, alike=True)
+    return moving.rows(*best, log_prior, _size_prior(sizes, signed=True), onsets)
+
+
+def _best_sizes(
+    moving: MovedMotor, sizes: SizePrior, signed: bool, alike: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return the size of each row that explains its moments best, and the variance about it.
+
+    Args:
+        moving: The motor.
+        sizes: Sizes of its fault.
+        signed: Whether they have either sign.
+        alike: Whether the angle does not depend on the row.
+    """
     low, high = sizes.ends
     grid = coarse_sizes(low, high)
-    grid = np.concatenate([-grid[::-1], grid]) if mode.signed else grid
-    grid = np.tile(grid, (scene.moments.runs, 1))
-    least = -high if mode.signed else low
-    best = moving.best(grid, alike=not growing)
+    grid = np.concatenate([-grid[::-1], grid]) if signed else grid
+    grid = np.tile(grid, (moving.scene.moments.runs, 1))
+    best, least = moving.best(grid, alike), -high if signed else low
     x = moving.refined(best, np.full((1, 1), least), np.full((1, 1), high))
     slope = np.sqrt(np.mean(moving.slope(x, ARRIVED) ** 2, axis=-1))
-    deviation = np.minimum(FREE_RAD / np.maximum(slope, 1e-6), 0.5 * high)
-    prior = _size_prior(sizes, mode.signed)
-    return moving.rows(x, deviation**2, log_prior, prior, sampled(onsets, shares))
+    return x, np.minimum(FREE_RAD / np.maximum(slope, 1e-6), 0.5 * high) ** 2
 
 
 def moment_intervals(scene: Scene) -> OnsetIntervals:
-    """Return the time in which an onset affects each moment first: up to that moment."""
-    end = scene.moments.time
-    return OnsetIntervals(np.concatenate([np.zeros_like(end[:, :1]), end[:, :-1]], axis=1), end)
+    """Return the time in which an onset affects each moment first: up to that moment.
+
+    On a curve an error of the command shows one lag later.
+    """
+    moments, lag_s = scene.moments, scene.model.lag_s
+    begin = np.concatenate([np.zeros_like(moments.time[:, :1]), moments.time[:, :-1]], axis=1)
+    begin = np.where(moments.on_curves, np.maximum(begin - lag_s, 0.0), begin)
+    return OnsetIntervals(begin, moments.time)
 
 
 def _offset_angle(scene: Scene, motor: int, mode: FaultMode, since: FloatArray) -> Angle:

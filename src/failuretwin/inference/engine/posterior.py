@@ -103,6 +103,10 @@ def _size(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> 
     if rows.drawn is not None:
         some, share = some[share > LEAST_SHARE], share[share > LEAST_SHARE]
         mean, deviation = _mean_squares(evidence, h, some)
+        picks = evidence.weighed[h].picks[some]
+        constant = rows.variance[picks.run, picks.row] > 0.0
+        size, spread = _amounts(evidence, h, some[constant]).T
+        mean[constant], deviation[constant] = size**2 + spread**2, 2.0 * np.abs(size) * spread
     elif rows.amount_prior is not None:
         mean, deviation = _amounts(evidence, h, some).T
         if is_held(evidence.hypotheses[h]):

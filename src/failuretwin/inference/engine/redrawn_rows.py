@@ -2,7 +2,8 @@
 
 The outcomes of a moment are nodes over the size with both signs, each widened by half the distance
 to the next; beside a lost command of another motor the error counts as normal. Each range of sizes
-is a row, and each later onset one with any range.
+is a row, and each later onset one with any range. On a curve, which is one movement, an error that
+begins there may also stay as it is: rows of its size.
 
 Section: docs/inference.md#hypotheses
 """
@@ -16,12 +17,15 @@ import numpy as np
 from failuretwin.core.numerics import log_of
 from failuretwin.core.types import FloatArray
 from failuretwin.failure_behavior.mode import FaultMode
+from failuretwin.inference.engine.offset_rows import constant_rows, moment_intervals
 from failuretwin.inference.engine.outcomes import Outcomes
 from failuretwin.inference.engine.rows import Drawn, Rows, Scene, sampled
 from failuretwin.inference.faults.priors import OnsetIntervals, shares_above
 
 NODES, DECADE = 16, 8
 """Nodes of the size on each side of zero, in a constant ratio: at least, and in a factor of 10."""
+CONSTANT = 0.5
+"""Share of the errors that begin on a curve and then stay as they are; assumed."""
 SMALLEST = 1e-2
 """Smallest node, as a share of the largest size, where sizes begin at nothing, or at what shows
 only once the noise of the sensor is found."""
@@ -63,7 +67,7 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
     of_row = np.minimum(np.arange(rows), len(shares))
     samples, share = intervals.samples(early)
     nothing = np.zeros((runs, rows))
-    return Rows(
+    redrawn = Rows(
         log_prior,
         first,
         outcomes.with_rows(),
@@ -82,6 +86,13 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
         ),
         onsets=sampled(samples[:, first], share[:, first]),
     )
+    curved = moments.on_curves.any(axis=1)
+    if not curved.any():
+        return redrawn
+    stays = np.where(curved, CONSTANT, 0.0)[:, None]
+    log_prior[:, len(shares) :] += log_of(1.0 - stays)
+    constant = constant_rows(scene, motor, sizes, early)
+    return redrawn.beside(replace(constant, log_prior=constant.log_prior + log_of(stays)))
 
 
 def _mass(edge: FloatArray, low: float, high: float) -> FloatArray:
@@ -155,6 +166,13 @@ def _weights(scene: Scene, masses: FloatArray) -> FloatArray:
 
 
 def _intervals(scene: Scene) -> OnsetIntervals:
-    """Return the time in which an onset affects each moment first: up to its movement."""
-    start = scene.moments.start
-    return OnsetIntervals(np.concatenate([np.zeros_like(start[:, :1]), start[:, :-1]], 1), start)
+    """Return the time in which an onset affects each moment first: up to its movement.
+
+    On a curve an error is there at once: up to the moment itself.
+    """
+    start, curve = scene.moments.start, scene.moments.on_curves
+    whole, at_once = curve.copy(), moment_intervals(scene)
+    whole[:, :-1] |= curve[:, 1:]
+    begin = np.concatenate([np.zeros_like(start[:, :1]), start[:, :-1]], axis=1)
+    begin = np.where(curve, at_once.begin, begin)
+    return OnsetIntervals(begin, np.where(whole, at_once.end, start))

@@ -86,6 +86,61 @@ class Rows:
     tie: FloatArray | None = None
     own: Sequence[int] = ()
 
+    def beside(self, other: Rows) -> Rows:
+        """Return these rows and others of the same hypothesis behind them.
+
+        Args:
+            other: Rows whose outcomes are the first of these, with an amount, not drawn.
+        """
+        count = self.log_prior.shape[1]
+        more = self.log_weight.shape[-1] - other.log_weight.shape[-1]
+
+        def columns_of(
+            run: IntArray, row: IntArray, moment: IntArray, outcome: IntArray
+        ) -> FloatArray:
+            found, theirs = self.columns_of(run, row, moment, outcome), row >= count
+            at = run[theirs], row[theirs] - count, moment[theirs], outcome[theirs]
+            found[theirs] = other.columns_of(*at)
+            return found
+
+        def amount_prior(x: FloatArray, run: IntArray, row: IntArray) -> FloatArray:
+            assert other.amount_prior is not None
+            return other.amount_prior(x, run, row - count)
+
+        def onsets(run: int, row: int, amount: FloatArray) -> tuple[FloatArray, FloatArray]:
+            one, at = (self, row) if row < count else (other, row - count)
+            assert one.onsets is not None
+            return one.onsets(run, at, amount)
+
+        def wide(array: FloatArray) -> FloatArray:
+            return np.broadcast_to(array, (len(array), count, *array.shape[2:]))
+
+        def joined(name: str) -> FloatArray:
+            return np.concatenate([wide(getattr(self, name)), getattr(other, name)], axis=1)
+
+        pairs = zip(self.outcomes.arrays, other.outcomes.arrays, strict=True)
+        outcomes = [np.concatenate([wide(a), _padded(b, more)], axis=1) for a, b in pairs]
+        weight = _padded(other.log_weight, more, -np.inf)
+        drawn = self.drawn
+        if drawn is not None:
+            square = np.concatenate([drawn.square, np.zeros((other.log_prior.shape[1], 2))])
+            drawn = replace(drawn, square=square)
+        return replace(
+            self,
+            log_prior=np.concatenate([self.log_prior, other.log_prior], axis=1),
+            first=np.concatenate([self.first, other.first]),
+            outcomes=Outcomes(*outcomes),
+            log_weight=np.concatenate([self.log_weight, weight], axis=1),
+            columns=joined("columns"),
+            columns_of=columns_of,
+            lever=joined("lever"),
+            centre=joined("centre"),
+            variance=joined("variance"),
+            amount_prior=amount_prior,
+            drawn=drawn,
+            onsets=onsets,
+        )
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -168,6 +223,12 @@ class Scene:
     def settled(self) -> FloatArray:
         """Settled angles where every command arrives, (run, moment, motor) [rad]."""
         return self.pose[:, :, 0]
+
+
+def _padded(array: FloatArray, more: int, value: float = 0.0) -> FloatArray:
+    """Return an array (run, row, moment, outcome, ...) with room for more outcomes."""
+    width = [(0, more if axis == 3 else 0) for axis in range(array.ndim)]
+    return np.pad(array, width, constant_values=value)
 
 
 def sampled(onset: FloatArray, share: FloatArray) -> Onsets:

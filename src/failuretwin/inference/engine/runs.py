@@ -334,13 +334,12 @@ class RunsEvidence:
         total = found.total + rows.log_prior[picks.run, picks.row]
         if h in self.left_out:
             total = total + self.left_out[h][picks.run]
-        amount = found.amount.copy()
-        if rows.amount_prior is None:
-            amount[:, 1] = np.sqrt(np.maximum(amount[:, 1], 0.0))
-            amount[:, 0] += rows.centre[picks.run, picks.row]
-        else:
-            gain, amount = _with_amount_prior(rows, picks, amount)
-            total = total + gain
+        amount = np.sqrt(np.maximum(found.amount, 0.0))
+        amount[:, 0] = found.amount[:, 0] + rows.centre[picks.run, picks.row]
+        some = np.flatnonzero(rows.variance[picks.run, picks.row] > 0.0)
+        if rows.amount_prior is not None and len(some):
+            gain, amount[some] = _with_amount_prior(rows, picks[some], found.amount[some])
+            total[some] += gain
         more, lossy = self._with_losses(part, found)
         return Weighed(picks, total + more, found, amount, lossy)
 
