@@ -249,6 +249,7 @@ def simulated(
     drive = Drive(wanted[None], held, compliance=arm.compliance[None])
     position = ServoEngine(robot).angles(drive, time)[0]
     measured, read = _sensed(robot, position, time, rate, late, rng)
+    there = error[time >= onset, case.motor] if np.isfinite(onset) else error[:, 0]
     name = "healthy" if case.motor < 0 else f"{robot.motor_names[case.motor]}:{case.fault}"
     return RunTable(
         run=[f"{name}/{case.seed}"],
@@ -258,9 +259,7 @@ def simulated(
         measured=measured[None],
         position=read[None],
         measured_rate_hz=rate,
-        truth=Truth(
-            [name], [{}], np.array([onset]), np.array([np.sqrt(np.mean(error**2)) * motors**0.5])
-        ),
+        truth=Truth([name], [{}], np.array([onset]), np.array([np.sqrt(np.mean(there**2))])),
         attributes={"robot": robot.name, "source": "simulated"},
     )
 
@@ -414,9 +413,9 @@ class Judge:
         tables = [simulated(self.robot, self.motion, case, *self.sensed) for case in some]
         return concatenate([table.to_dataset() for table in tables])
 
-    def found(self, some: Sequence[Case]) -> tuple[list[Diagnosis], float]:
-        """Return what is found of some cases, and the processor time it takes [s]."""
-        given, runs = self.given, self.table(some)
+    def found(self, runs: xr.Dataset, some: Sequence[Case]) -> tuple[list[Diagnosis], float]:
+        """Return what is found of the runs of some cases, and the processor time it takes [s]."""
+        given = self.given
         known: Imperfections | str = given.calibration
         if given.calibrated:
             own = [Case("healthy", -1, OWN_SEED + n) for n in range(given.calibrated)]
@@ -448,6 +447,25 @@ def line(found: list[Diagnosis], seconds: float) -> str:
     parts.append(f"wrong above 99 % {sure}, {nats(found).mean():.3f} nats")
     parts.append(f"{1e3 * seconds / len(found):.0f} ms a run")
     return ", ".join(parts)
+
+
+def intervals(found: list[Diagnosis], runs: xr.Dataset) -> str:
+    """Return how many 90 % intervals hold the truth, of the faults that are named right."""
+    told = []
+    for mode, field, name in (
+        ("stuck", "onset_90", "onset"),
+        ("steady_state_error", "onset_90", "onset"),
+        ("steady_state_error", "magnitude_90", "magnitude"),
+    ):
+        pairs = zip(found, as_floats(runs[name].values).tolist(), strict=True)
+        some = [
+            (getattr(d, field), value)
+            for d, value in pairs
+            if d.diagnosis == d.truth and str(d.truth).endswith(mode)
+        ]
+        inside = sum(bool(ends) and ends[0] <= value <= ends[1] for ends, value in some)
+        told.append(f"{name} of {mode} {inside} of {len(some)}")
+    return f"in their 90 % intervals: {', '.join(told)}"
 
 
 def main() -> None:
@@ -494,8 +512,11 @@ def main() -> None:
                 alarms = [watched(robot, stream) for stream in streams]
                 print(f"{name} {motion}: {watch_line(alarms, given.watch)}", flush=True)
                 continue
-            found, seconds = Judge(robot, path, sensed, given).found(some)
+            judge = Judge(robot, path, sensed, given)
+            runs = judge.table(some)
+            found, seconds = judge.found(runs, some)
             print(f"{name} {motion}: {line(found, seconds)}", flush=True)
+            print(f"{name} {motion}: {intervals(found, runs)}", flush=True)
             every += found
     if every:
         print(f"all: {line(every, np.nan)}, {calibration(every, np.random.default_rng(0))}")

@@ -136,6 +136,22 @@ def test_a_motor_that_stops_on_a_curve_is_found_where_the_tool_rests_behind_it()
     assert found.onset_90[0] <= 3.5 <= found.onset_90[1]
 
 
+@pytest.mark.parametrize(("motor", "at"), [(0, 200), (0, 330), (2, 520)])
+def test_a_motor_that_stops_on_a_curve_did_so_where_it_was_told_to_pass(motor, at):
+    """The straight line between two moments is off that by up to half a second."""
+    command = curve()
+    stuck, runs = command.copy(), exact_run(command, 0.0)
+    stuck[at:, motor] = stuck[at, motor]
+    seen = np.full((len(command), 3), np.nan)
+    seen[::10] = DigitalTwin(ROBOT).path(stuck[::10])
+    (found,) = ft.diagnose(
+        runs.assign(measured=(runs["measured"].dims, seen[None])), ROBOT, "generic"
+    )
+    assert str(found.diagnosis) == f"motor_{motor + 1}:stuck"
+    assert found.onset_90[0] <= STEP_S * at <= found.onset_90[1]
+    assert found.onset_s == pytest.approx(STEP_S * at, abs=0.12)
+
+
 @pytest.mark.parametrize(("motor", "error", "at"), [(0, 0.15, 310), (1, -0.2, 420), (2, 0.2, 350)])
 def test_an_error_that_comes_on_a_curve_and_stays_is_sized_and_dated(motor, error, at):
     """Taken for another zero of its motor, it would seem there from the start, at half its size."""

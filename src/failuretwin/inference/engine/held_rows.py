@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtri
 
+from failuretwin.core.movements import AGES_S
 from failuretwin.core.numerics import log_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.inference.engine.moved_motor import FREE_RAD, Angle, MovedMotor
@@ -32,6 +33,9 @@ POINTS = np.linspace(0.05, 0.95, 10)
 """Where in a stretch of time onsets are sampled, as shares of its length."""
 NORMAL_QUANTILES = ndtri(POINTS)
 """The same of a normal distribution, in deviations."""
+AGES, LEAST_THERE = 81, 1e-4
+"""Onsets that are looked at between two moments on a curve, and what a motor that was nowhere near
+its held angle counts for, in what one that was there does."""
 STILL_RAD = 1e-6
 """A ramp that is shorter is none [rad]."""
 OFF_RAMP = 0.05
@@ -147,12 +151,16 @@ def _stuck_onsets(
 
         t = begin + T (x - was) / (goal - was),    var(t) = T^2 (d^2 + s^2) / (goal - was)^2 + l^2
 
-    with s the scatter of the motor about its command.
+    with s the scatter of the motor about its command. On a curve, by the command q(a) of age a,
+
+        p(t = time - a) ~ N(x; q(a), d^2 + s^2 + b^2)
+
+    with b what it is off by chance on its way.
     """
     model = scene.model
     begin, length = np.nan_to_num(intervals.begin), intervals.length
     lag, scatter = np.hypot(*model.lag_deviations_s), float(model.scatter[motor])
-    share = np.full(len(POINTS), 1.0 / len(POINTS))
+    share, curved = np.full(len(POINTS), 1.0 / len(POINTS)), scene.moments.on_curves
 
     def of_row(run: int, row: int, amount: FloatArray) -> tuple[FloatArray, FloatArray]:
         m, on_ramp = divmod(row, 2)
@@ -163,6 +171,12 @@ def _stuck_onsets(
             return parts[0], share
         first, travel = was[run, m], goal[run, m] - was[run, m]
         held, deviation = amount
+        if curved[run, m]:
+            by_chance = scene.moments.late[run, m, 0, motor] + scene.moments.bent[run, m, 0, motor]
+            width = np.sqrt(deviation**2 + scatter**2 + by_chance)
+            told = scene.moments.behind[run, m, motor] + goal[run, m]
+            end = scene.moments.time[run, m]
+            return _on_a_curve(told, (end - length[run, m, 1], end), held, width, lag)
         passed = (held - first) / travel if abs(travel) > STILL_RAD else np.inf
         if not -OFF_RAMP < passed < 1.0 + OFF_RAMP:
             return parts.ravel()[::2], share
@@ -172,3 +186,25 @@ def _stuck_onsets(
         return np.maximum(middle + spread * NORMAL_QUANTILES, 0.0), share
 
     return of_row
+
+
+def _on_a_curve(
+    told: FloatArray, between: tuple[float, float], held: float, width: float, lag_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return onsets before a moment on a curve [s] and their shares: when the motor was there.
+
+    Args:
+        told: Where it would be at the moment if it followed `AGES_S` later, (age,) [rad].
+        between: When its stretch begins and ends [s].
+        held: Held angle [rad].
+        width: Deviation of the motor from it where it stopped [rad].
+        lag_s: Deviation of the lag [s].
+    """
+    begin, end = between
+    age = np.linspace(0.0, min(AGES_S[-1], end - begin), AGES)
+    told = np.interp(age, AGES_S, told)
+    spread = np.hypot(width, np.gradient(told) / np.sqrt(12.0))  # and between two ages
+    there = width / spread * np.exp(-0.5 * ((held - told) / spread) ** 2)
+    share = np.repeat(there + LEAST_THERE, len(NORMAL_QUANTILES))
+    onset = end - age[:, None] + lag_s * NORMAL_QUANTILES
+    return np.maximum(onset, 0.0).ravel(), share / share.sum()

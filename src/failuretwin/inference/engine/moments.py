@@ -92,8 +92,10 @@ class Moments:
 
     @property
     def on_curves(self) -> BoolArray:
-        """Which moments follow another on the same curve, (run, moment)."""
-        return (self.kept > 0.0) & (self.kept < 1.0)
+        """Which moments are on a curve that has others too, (run, moment)."""
+        found = (self.kept > 0.0) & (self.kept < 1.0)
+        found[:, :-1] |= found[:, 1:]
+        return found
 
     @property
     def runs(self) -> int:

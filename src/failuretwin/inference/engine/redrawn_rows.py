@@ -170,9 +170,8 @@ def _intervals(scene: Scene) -> OnsetIntervals:
 
     On a curve an error is there at once: up to the moment itself.
     """
-    start, curve = scene.moments.start, scene.moments.on_curves
-    whole, at_once = curve.copy(), moment_intervals(scene)
-    whole[:, :-1] |= curve[:, 1:]
+    moments, at_once = scene.moments, moment_intervals(scene)
+    start, curve = moments.start, moments.on_curves
     begin = np.concatenate([np.zeros_like(start[:, :1]), start[:, :-1]], axis=1)
-    begin = np.where(curve, at_once.begin, begin)
-    return OnsetIntervals(begin, np.where(whole, at_once.end, start))
+    begin = np.where(curve & (moments.kept > 0.0), at_once.begin, begin)
+    return OnsetIntervals(begin, np.where(curve, at_once.end, start))
