@@ -133,11 +133,16 @@ def held_range(scene: Scene, motor: int) -> tuple[FloatArray, FloatArray]:
 
 
 def stuck_intervals(scene: Scene, motor: int) -> OnsetIntervals:
-    """Return plateau and ramp before each moment, (run, moment, plateau | ramp) [s]."""
+    """Return plateau and ramp before each moment, (run, moment, plateau | ramp) [s].
+
+    Readings on the way tell by how much they trail their commands.
+    """
     moments, model = scene.moments, scene.model
-    start = moments.start + model.lag_s
-    ramp = moments.ramp[..., motor] * (1.0 - model.shortening)
-    return plateau_or_ramp(start, start + ramp)
+    ramp = moments.ramp * (1.0 - model.shortening)
+    trailed = moments.time - moments.start - ramp.max(axis=-1)
+    on_way = moments.speed[:, :, 0].any(axis=-1)
+    start = moments.start + np.where(on_way, trailed, model.lag_s)
+    return plateau_or_ramp(start, start + ramp[..., motor])
 
 
 def _stuck_onsets(

@@ -92,54 +92,71 @@ class Rows:
         Args:
             other: Rows whose outcomes are the first of these, with an amount, not drawn.
         """
-        count = self.log_prior.shape[1]
+        both = _Both(self, other)
         more = self.log_weight.shape[-1] - other.log_weight.shape[-1]
-
-        def columns_of(
-            run: IntArray, row: IntArray, moment: IntArray, outcome: IntArray
-        ) -> FloatArray:
-            found, theirs = self.columns_of(run, row, moment, outcome), row >= count
-            at = run[theirs], row[theirs] - count, moment[theirs], outcome[theirs]
-            found[theirs] = other.columns_of(*at)
-            return found
-
-        def amount_prior(x: FloatArray, run: IntArray, row: IntArray) -> FloatArray:
-            assert other.amount_prior is not None
-            return other.amount_prior(x, run, row - count)
-
-        def onsets(run: int, row: int, amount: FloatArray) -> tuple[FloatArray, FloatArray]:
-            one, at = (self, row) if row < count else (other, row - count)
-            assert one.onsets is not None
-            return one.onsets(run, at, amount)
-
-        def wide(array: FloatArray) -> FloatArray:
-            return np.broadcast_to(array, (len(array), count, *array.shape[2:]))
-
-        def joined(name: str) -> FloatArray:
-            return np.concatenate([wide(getattr(self, name)), getattr(other, name)], axis=1)
-
         pairs = zip(self.outcomes.arrays, other.outcomes.arrays, strict=True)
-        outcomes = [np.concatenate([wide(a), _padded(b, more)], axis=1) for a, b in pairs]
-        weight = _padded(other.log_weight, more, -np.inf)
-        drawn = self.drawn
-        if drawn is not None:
-            square = np.concatenate([drawn.square, np.zeros((other.log_prior.shape[1], 2))])
-            drawn = replace(drawn, square=square)
+        padded = _padded(other.log_weight, more, -np.inf)
         return replace(
             self,
-            log_prior=np.concatenate([self.log_prior, other.log_prior], axis=1),
+            log_prior=both.joined(self.log_prior, other.log_prior),
             first=np.concatenate([self.first, other.first]),
-            outcomes=Outcomes(*outcomes),
-            log_weight=np.concatenate([self.log_weight, weight], axis=1),
-            columns=joined("columns"),
-            columns_of=columns_of,
-            lever=joined("lever"),
-            centre=joined("centre"),
-            variance=joined("variance"),
-            amount_prior=amount_prior,
-            drawn=drawn,
-            onsets=onsets,
+            outcomes=Outcomes(*(both.joined(a, _padded(b, more)) for a, b in pairs)),
+            log_weight=both.joined(self.log_weight, padded),
+            columns=both.joined(self.columns, other.columns),
+            columns_of=both.columns_of,
+            lever=both.joined(self.lever, other.lever),
+            centre=both.joined(self.centre, other.centre),
+            variance=both.joined(self.variance, other.variance),
+            amount_prior=both.amount_prior,
+            drawn=both.drawn,
+            onsets=both.onsets,
         )
+
+
+@dataclass(frozen=True)
+class _Both:
+    """Rows of a hypothesis, and others behind them."""
+
+    rows: Rows
+    other: Rows
+
+    @property
+    def _count(self) -> int:
+        return self.rows.log_prior.shape[1]
+
+    def joined(self, own: FloatArray, others: FloatArray) -> FloatArray:
+        """Return values of both, (run, row, ...); those of the first may be common to all rows."""
+        wide = np.broadcast_to(own, (len(own), self._count, *own.shape[2:]))
+        return np.concatenate([wide, others], axis=1)
+
+    @property
+    def drawn(self) -> Drawn | None:
+        """Sizes that are drawn, of the first rows."""
+        found = self.rows.drawn
+        if found is None:
+            return None
+        nothing = np.zeros((self.other.log_prior.shape[1], 2))
+        return replace(found, square=np.concatenate([found.square, nothing]))
+
+    def columns_of(
+        self, run: IntArray, row: IntArray, moment: IntArray, outcome: IntArray
+    ) -> FloatArray:
+        """Return G; see `ColumnsOf`."""
+        found, theirs = self.rows.columns_of(run, row, moment, outcome), row >= self._count
+        at = run[theirs], row[theirs] - self._count, moment[theirs], outcome[theirs]
+        found[theirs] = self.other.columns_of(*at)
+        return found
+
+    def amount_prior(self, x: FloatArray, run: IntArray, row: IntArray) -> FloatArray:
+        """Return the log density of amounts, which the rows behind have; see `AmountPrior`."""
+        assert self.other.amount_prior is not None
+        return self.other.amount_prior(x, run, row - self._count)
+
+    def onsets(self, run: int, row: int, amount: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return samples of the onset; see `Onsets`."""
+        one, at = (self.rows, row) if row < self._count else (self.other, row - self._count)
+        assert one.onsets is not None
+        return one.onsets(run, at, amount)
 
 
 @dataclass(frozen=True)
