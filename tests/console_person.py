@@ -12,7 +12,8 @@ from selenium.webdriver.common.keys import Keys
 
 PICTURES = os.environ.get("FAILURETWIN_PICTURES")
 """Folder for the pictures of README and docs; empty: none are taken."""
-LONGEST_S = 180.0
+LONGEST_S = 500.0
+"""Longest wait [s]: ends what hangs, not what is slow."""
 
 
 class Person:
