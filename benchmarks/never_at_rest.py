@@ -2,7 +2,7 @@
 
     python benchmarks/never_at_rest.py [--robot armpi_fpv ur5e so101 panda] [--motion blended ...]
         [--rate 10] [--calibration generic] [--healthy 20] [--faulty 3] [--clock 0.0] [--folder]
-        [--calibrated 20] [--told] [--watch 120] [--rest 5] [--sensing encoders] [--late]
+        [--calibrated 20] [--told] [--watch 120] [--rest 5] [--sensing encoders] [--also lag slow]
     python benchmarks/never_at_rest.py --logs FOLDER [--share 0.85] [--calibration armpi_fpv]
 
 Five motions, ten seconds each: point to point without a stop, sinusoids, splines as of a leader
@@ -11,8 +11,9 @@ all are of one), drawn from what its class is like: bias, sag, friction, lag; sc
 a second or so. A motor gets stuck at any time, or is off by two to four times what can be seen of
 it: by another error after each stroke, or, on curves, by one that comes in mid-run. With
 `--calibrated N` all are of one robot, calibrated from N healthy runs of the same motion. With
-`--rest` an arm stands still for the last seconds of its runs. With `--late` motors also come to
-follow 0.2 s late, in mid-run, and that is among the hypotheses. With
+`--rest` an arm stands still for the last seconds of its runs. With `--also lag` motors also come to
+follow 0.2 s late in mid-run, with `--also slow` they lose half of their speed from the next stroke
+on: it takes twice as long, the next one begins where it was cut off. With
 `--told` the diagnosis is told the shares of healthy and faulty runs and the sizes of errors as
 drawn: only then can the calibration error be that of chance.
 """
@@ -23,6 +24,7 @@ import argparse
 import time as clock
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import xarray as xr
@@ -153,6 +155,8 @@ class Case:
 MODES = ("stuck", "steady_state_error")
 LATE, DEAD_S = "lag", 0.2
 """The mode of motors that come to follow late, and by how much [s]."""
+SLOW, SPEED = "slow", 0.5
+"""The mode of motors that lose speed, and what is left of it."""
 
 
 def cases(
@@ -235,8 +239,11 @@ def simulated(
     speed = np.gradient(command, STEP_S, axis=0)
     friction = np.asarray(settling.friction) * _direction(speed)
     followed = command.copy()
-    if case.fault == LATE:
+    if case.fault in (LATE, SLOW):
         onset = rng.uniform(*ONSET_OF_CURVES) * duration_s
+    if case.fault == SLOW:
+        followed[:, case.motor] = _slowed(time, command[:, case.motor], strokes, onset)
+    if case.fault == LATE:
         late_by = np.where(time < onset, 0.0, DEAD_S)
         followed[:, case.motor] = np.interp(time - late_by, time, command[:, case.motor])
     wanted = followed + np.asarray(settling.bias) - friction + scatter + error
@@ -283,6 +290,23 @@ def _errors(
         [-1.0, 1.0], len(strokes)
     )
     return np.interp(time, strokes, size)
+
+
+def _slowed(time: FloatArray, command: FloatArray, strokes: FloatArray, onset: float) -> FloatArray:
+    """Return where a motor is told to be that makes its strokes slowly from an onset on [rad]."""
+    found, ends = command.copy(), np.append(strokes, np.inf)
+    here = np.nan
+    for begin, end in pairwise(ends.tolist()):
+        if begin < onset or begin > time[-1]:
+            continue
+        low, high = np.interp([begin, min(end, time[-1])], time, command)
+        here = low if np.isnan(here) else here
+        inside = (time >= begin) & (time <= end)
+        told = np.interp(begin + SPEED * (time[inside] - begin), time, command)
+        share = (told - low) / (high - low) if high != low else np.zeros(inside.sum())
+        found[inside] = here + (high - here) * share
+        here = found[inside][-1]
+    return found
 
 
 def _sensed(
@@ -426,8 +450,8 @@ class Judge:
             found = ft.SelfCalibratingDiagnoser(self.robot).diagnose(runs)
         else:
             motors = self.robot.motor_names
-            late = [Hypothesis.parse(f"{motor}:{LATE}") for motor in motors]
-            hypotheses = [*paper_hypotheses(motors), *late] if given.late else None
+            also = [Hypothesis.parse(f"{motor}:{mode}") for mode in given.also for motor in motors]
+            hypotheses = [*paper_hypotheses(motors), *also] if also else None
             found = ft.diagnose(
                 runs, self.robot, known, hypotheses, priors=priors, sensing=given.sensing
             )
@@ -439,9 +463,9 @@ def line(found: list[Diagnosis], seconds: float) -> str:
     healthy = [d for d in found if d.truth == "healthy"]
     false = sum(d.diagnosis != "healthy" for d in healthy)
     parts = [f"healthy blamed {false} of {len(healthy)}"]
-    for mode in (*MODES, LATE):
+    for mode in (*MODES, LATE, SLOW):
         some = [d for d in found if str(d.truth).endswith(mode)]
-        if some or mode != LATE:
+        if some or mode in MODES:
             parts.append(f"{mode} {int(right(some).sum())} of {len(some)}")
     sure = sum(d.diagnosis != d.truth and max(d.posterior.values()) > 0.99 for d in found)
     parts.append(f"wrong above 99 % {sure}, {nats(found).mean():.3f} nats")
@@ -485,7 +509,7 @@ def main() -> None:
     parser.add_argument("--told", action="store_true", help="shares and sizes as drawn")
     parser.add_argument("--rest", type=float, default=0.0, help="last seconds that stand still")
     parser.add_argument("--sensing", default="tool", help="what is believed")
-    parser.add_argument("--late", action="store_true", help="motors that follow late, too")
+    parser.add_argument("--also", nargs="+", default=[], choices=[LATE, SLOW], help="more faults")
     parser.add_argument("--logs")
     parser.add_argument("--share", type=float)
     given = parser.parse_args()
@@ -496,7 +520,7 @@ def main() -> None:
     for name in given.robot:
         robot = load_robot(name)
         for motion in given.motion:
-            modes = (*MODES, LATE) if given.late else MODES
+            modes = (*MODES, *given.also)
             some = list(cases(robot, modes, given.healthy, given.faulty, given.seed))
             path = resting(MOTIONS[motion], given.rest)
             one = given.folder or given.calibrated

@@ -1,4 +1,4 @@
-"""A motor that is off by a size that holds for the run, or grows, or that is so much later.
+"""A motor that is off by a size that holds for the run, or grows.
 
 Section: docs/inference.md#hypotheses
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from failuretwin.core.movements import AGES_S
 from failuretwin.core.numerics import log_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.settling import sag
@@ -45,11 +44,9 @@ def offset_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
         log_prior, first = log_of(intervals.weights(early)), np.arange(count)
         since = np.full((1, 1, 1), LONG_S)
         onsets, shares = intervals.samples(early)
-    late = mode.signature is Signature.TRANSIENT
-    angle = _late_angle(scene, motor, mode) if late else _offset_angle(scene, motor, mode, since)
-    moving = MovedMotor(scene, motor, False, angle, first)
-    best = _best_sizes(moving, sizes, mode.signed, alike=not growing)
-    return moving.rows(*best, log_prior, _size_prior(sizes, mode.signed), sampled(onsets, shares))
+    moving = MovedMotor(scene, motor, False, _offset_angle(scene, motor, mode, since), first)
+    best = best_sizes(moving, sizes, mode.signed, alike=not growing)
+    return moving.rows(*best, log_prior, size_prior(sizes, mode.signed), sampled(onsets, shares))
 
 
 def constant_rows(scene: Scene, motor: int, sizes: SizePrior, early: float) -> Rows:
@@ -73,11 +70,11 @@ def constant_rows(scene: Scene, motor: int, sizes: SizePrior, early: float) -> R
     onset, share = intervals.samples(early)
     onsets = sampled(onset[:, 1:], share[:, 1:])
     log_prior = log_of(intervals.weights(early)[:, 1:])
-    best = _best_sizes(moving, sizes, signed=True, alike=True)
-    return moving.rows(*best, log_prior, _size_prior(sizes, signed=True), onsets)
+    best = best_sizes(moving, sizes, signed=True, alike=True)
+    return moving.rows(*best, log_prior, size_prior(sizes, signed=True), onsets)
 
 
-def _best_sizes(
+def best_sizes(
     moving: MovedMotor, sizes: SizePrior, signed: bool, alike: bool
 ) -> tuple[FloatArray, FloatArray]:
     """Return the size of each row that explains its moments best, and the variance about it.
@@ -107,6 +104,18 @@ def moment_intervals(scene: Scene) -> OnsetIntervals:
     begin = np.concatenate([np.zeros_like(moments.time[:, :1]), moments.time[:, :-1]], axis=1)
     begin = np.where(moments.on_curves, np.maximum(begin - lag_s, 0.0), begin)
     return OnsetIntervals(begin, moments.time)
+
+
+def movement_intervals(scene: Scene) -> OnsetIntervals:
+    """Return the time in which an onset affects each moment first: up to its movement.
+
+    On a curve an error is there at once: up to the moment itself.
+    """
+    moments, at_once = scene.moments, moment_intervals(scene)
+    start, curve = moments.start, moments.on_curves
+    begin = np.concatenate([np.zeros_like(start[:, :1]), start[:, :-1]], axis=1)
+    begin = np.where(curve & (moments.kept > 0.0), at_once.begin, begin)
+    return OnsetIntervals(begin, np.where(curve, at_once.end, start))
 
 
 def _offset_angle(scene: Scene, motor: int, mode: FaultMode, since: FloatArray) -> Angle:
@@ -139,30 +148,8 @@ def _offset_angle(scene: Scene, motor: int, mode: FaultMode, since: FloatArray) 
     return angle
 
 
-def _late_angle(scene: Scene, motor: int, mode: FaultMode) -> Angle:
-    """Return the angle of a motor on its way by the size of its dead time."""
-    behind = scene.moments.behind[:, :, motor]  # (run, moment, age)
-
-    def angle(x: FloatArray, outcome: IntArray) -> FloatArray:
-        settled, late = taken(scene.pose, outcome), mode.dead_time(x)
-        place = np.interp(late, AGES_S, np.arange(len(AGES_S), dtype=np.float64))
-        low = np.minimum(place.astype(np.int64), len(AGES_S) - 2)
-        run = np.arange(len(behind))[:, None, None]
-        before, after = (behind[run, :, low + k] for k in (0, 1))  # (run, row, node, moment)
-        off = np.swapaxes(before + (place - low)[..., None] * (after - before), 2, 3)
-        return settled[..., motor, None] + off
-
-    return angle
-
-
-def is_late(mode: FaultMode) -> bool:
-    """Return whether a fault is that a motor follows its command later, and nothing else."""
-    one = np.ones(1)
-    transient = mode.signature is Signature.TRANSIENT
-    return transient and mode.dead_time(one)[0] > 0.0 and mode.ramp_factor(one)[0] == 1.0
-
-
-def _size_prior(sizes: SizePrior, signed: bool) -> AmountPrior:
+def size_prior(sizes: SizePrior, signed: bool) -> AmountPrior:
+    """Return the prior of a size, of either sign if it is signed: all in a range as likely."""
     sides = 2.0 if signed else 1.0
     ranges = [
         (low, high, share) for (low, high), share in zip(sizes.ranges, sizes.shares, strict=True)

@@ -17,10 +17,10 @@ import numpy as np
 from failuretwin.core.numerics import log_of
 from failuretwin.core.types import FloatArray
 from failuretwin.failure_behavior.mode import FaultMode
-from failuretwin.inference.engine.offset_rows import constant_rows, moment_intervals
+from failuretwin.inference.engine.offset_rows import constant_rows, movement_intervals
 from failuretwin.inference.engine.outcomes import Outcomes
 from failuretwin.inference.engine.rows import Drawn, Rows, Scene, sampled
-from failuretwin.inference.faults.priors import OnsetIntervals, shares_above
+from failuretwin.inference.faults.priors import shares_above
 
 NODES, DECADE = 16, 8
 """Nodes of the size on each side of zero, in a constant ratio: at least, and in a factor of 10."""
@@ -57,7 +57,7 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
     sound[..., :usual] = moments.log_weight
     later = [np.where((np.arange(count) < m)[:, None], sound, any_range) for m in range(1, count)]
     weight = np.concatenate([faulty, np.stack(later, axis=1)], axis=1) if later else faulty
-    intervals = _intervals(scene)
+    intervals = movement_intervals(scene)
     early = scene.priors.onset.before_run(mode.mode)
     onset = intervals.weights(early)
     of_run = shares_above(sizes, scene.off_on_the_way(motor))
@@ -163,15 +163,3 @@ def _weights(scene: Scene, masses: FloatArray) -> FloatArray:
         ],
         axis=1,
     )
-
-
-def _intervals(scene: Scene) -> OnsetIntervals:
-    """Return the time in which an onset affects each moment first: up to its movement.
-
-    On a curve an error is there at once: up to the moment itself.
-    """
-    moments, at_once = scene.moments, moment_intervals(scene)
-    start, curve = moments.start, moments.on_curves
-    begin = np.concatenate([np.zeros_like(start[:, :1]), start[:, :-1]], axis=1)
-    begin = np.where(curve & (moments.kept > 0.0), at_once.begin, begin)
-    return OnsetIntervals(begin, np.where(curve, at_once.end, start))

@@ -25,11 +25,12 @@ from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.filter import RowsPosterior
 from failuretwin.inference.engine.healthy_rows import healthy_rows
 from failuretwin.inference.engine.held_rows import held_rows
-from failuretwin.inference.engine.offset_rows import is_late, offset_rows
+from failuretwin.inference.engine.offset_rows import offset_rows
 from failuretwin.inference.engine.picks import Part, Picks, Prepared, narrowed, prepared
 from failuretwin.inference.engine.redrawn_rows import redrawn_rows
 from failuretwin.inference.engine.rows import Rows, Scene
 from failuretwin.inference.engine.theta import Components
+from failuretwin.inference.engine.transient_rows import transient_rows
 
 AMOUNT_STEPS = np.linspace(-4.0, 4.0, 33)
 """Nodes at which the prior of an amount is put in, in posterior deviations."""
@@ -95,14 +96,12 @@ def has_rows(hypothesis: Hypothesis, moving: bool = False) -> bool:
 
     Args:
         hypothesis: What may be the case.
-        moving: Whether there are moments on the way, which tell of one motor that is late too.
+        moving: Whether there are moments on the way, which tell of one that is late or slow too.
     """
     if not hypothesis.known or len(hypothesis.faults) > 1:
         return False
-    modes = [MODES[fault.mode] for fault in hypothesis.faults]
-    if moving and any(map(is_late, modes)):
-        return True
-    return all(mode.signature not in (Signature.TRANSIENT, Signature.MISSED) for mode in modes)
+    signatures = {MODES[fault.mode].signature for fault in hypothesis.faults}
+    return Signature.MISSED not in signatures and (moving or Signature.TRANSIENT not in signatures)
 
 
 def rows_of(scene: Scene, hypothesis: Hypothesis) -> Rows:
@@ -115,6 +114,8 @@ def rows_of(scene: Scene, hypothesis: Hypothesis) -> Rows:
         return held_rows(scene, motor)
     if mode.signature is Signature.REDRAWN_OFFSET:
         return redrawn_rows(scene, motor, mode)
+    if mode.signature is Signature.TRANSIENT:
+        return transient_rows(scene, motor, mode)
     return offset_rows(scene, motor, mode)
 
 
@@ -229,7 +230,8 @@ class RunsEvidence:
         """Probability that commands get lost more often, by each hypothesis, (run, hypothesis)."""
         found, whole = np.zeros(self.by_hypothesis.shape), self.by_hypothesis + self.log_odds
         for h, one in enumerate(self.weighed):
-            share = np.exp(self.height(h) - whole[one.picks.run, h])
+            total = whole[one.picks.run, h]
+            share = np.exp(self.height(h) - np.where(np.isfinite(total), total, 0.0))
             np.add.at(found[:, h], one.picks.run, share * one.lossy)
         return found
 
