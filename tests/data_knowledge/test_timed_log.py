@@ -11,6 +11,7 @@ from failuretwin.data_knowledge.readers.timed_log import (
     Samples,
     Targets,
     TimedLog,
+    as_told,
     timed_run,
 )
 
@@ -204,3 +205,37 @@ def test_milliseconds_taken_for_seconds_make_no_grid_of_a_million_samples(
         return
     with pytest.raises(InputError, match=r"milliseconds may have been taken for seconds"):
         timed_run(log, armpi)
+
+
+def streamed(rate_hz=10.0, seconds=6.0):
+    """Set points of a curve that rests from 2 to 4 s: their times and values (sample, motor)."""
+    time = np.arange(0.0, seconds, 1.0 / rate_hz)
+    moved = np.where(time < 2.0, time, np.where(time < 4.0, 2.0, time - 2.0))
+    return time, np.stack([np.sin(moved), 0.5 * np.cos(1.3 * moved)], axis=1)
+
+
+def written_faster(time, value, rate_hz=100.0):
+    """The same as a log that repeats each until the next one comes."""
+    fast = np.arange(0.0, time[-1] + 1e-9, 1.0 / rate_hz)
+    return Samples(fast, value[np.searchsorted(time, fast + 1e-9, side="right") - 1])
+
+
+@pytest.mark.parametrize("rate_hz", [4.0, 10.0, 30.0])
+def test_set_points_that_are_written_more_often_than_told_are_no_stairs(rate_hz):
+    time, value = streamed(rate_hz)
+    told = as_told(written_faster(time, value))
+    fast = np.arange(0.0, time[-1] - 1.0 / rate_hz, 0.01)
+    for motor in range(2):
+        wanted = np.interp(fast, time, value[:, motor])
+        found = np.interp(fast, told.time, told.value[:, motor])
+        assert np.abs(found - wanted).max() < 0.015  # a row late at most
+    assert len(told.time) < 1.2 * len(time)
+
+
+def test_commands_that_are_held_stay_steps():
+    """Once a second, or as often as they are written."""
+    seconds = np.repeat(np.arange(8.0), 100)[:, None]
+    slow = Samples(0.01 * np.arange(800), seconds)
+    dense = Samples(*streamed(100.0))
+    assert as_told(slow) is slow
+    assert as_told(dense) is dense

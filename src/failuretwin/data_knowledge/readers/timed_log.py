@@ -25,6 +25,12 @@ SAMPLES_PER_STAMP = 200
 """Steps of the time grid for each command or reading: two seconds of silence on average."""
 SAMPLES_ALWAYS = 100_000
 """Steps of the time grid that any log may have: a thousand seconds."""
+LONGEST_STEP_S, FEWEST_STEPS = 0.35, 6
+"""Set points of a stream are at most so far apart [s]; further ones are commands of their own. And
+from how many a stream is told."""
+STEADY, STEADY_SHARE = 0.25, 0.8
+"""Largest deviation of a steady step from the median, as a share of it, or a row of the log; share
+of steady steps."""
 
 
 @dataclass(frozen=True)
@@ -250,7 +256,8 @@ def uniform_grid(stamps: FloatArray, length: float, step: float, where: str) -> 
 def _command(log: TimedLog, time: FloatArray, begin: float) -> tuple[FloatArray, Movements | None]:
     """Return the reference on the grid (time, motor) [rad] and the movements, where known."""
     if isinstance(log.command, Samples):
-        lines = simplify_motors(log.command.time - begin, log.command.value, ROUNDING_RAD)
+        told = as_told(log.command)
+        lines = simplify_motors(told.time - begin, told.value, ROUNDING_RAD)
         return np.stack([np.interp(time, *line) for line in lines], axis=1), None
     movements = Movements(
         initial=_initial(log, log.command)[None],
@@ -259,6 +266,29 @@ def _command(log: TimedLog, time: FloatArray, begin: float) -> tuple[FloatArray,
         start=(log.command.time - begin)[None],
     )
     return movements.reference(time)[0], movements
+
+
+def as_told(command: Samples) -> Samples:
+    """Return a command without the rows that repeat a set point until the next one comes.
+
+    A log that is written faster than a stream of set points holds each for some rows: joined by
+    lines, these would be stairs. A command that is held for longer is a rest, which stays.
+    """
+    time, value = command.time, command.value
+    differs = np.any(value[1:] != value[:-1], axis=1)
+    new = np.flatnonzero(np.concatenate([[True], differs]))
+    apart = np.diff(time[new])
+    if len(apart) < FEWEST_STEPS:
+        return command
+    step = float(np.median(apart))
+    short = apart <= 1.5 * step
+    row = float(np.median(np.diff(time)))
+    steady = np.abs(apart[short] - step) <= max(STEADY * step, 1.5 * row)
+    often = np.median(np.diff(new)[short]) >= 2.0
+    if not (often and step <= LONGEST_STEP_S and steady.mean() >= STEADY_SHARE):
+        return command
+    ends = np.searchsorted(time, time[new[1:]][~short] - step, side="right") - 1
+    return command.take(np.unique(np.concatenate([new, ends, [len(time) - 1]])))
 
 
 def _initial(log: TimedLog, command: Targets) -> FloatArray:
