@@ -63,6 +63,7 @@ def verdicts(log_posterior, names):
 
 
 TRUTHS = ["healthy", "motor_2:stuck", "motor_3:steady_state_error", "motor_4:stuck"]
+FEW = [Hypothesis.parse(name) for name in TRUTHS]
 
 
 @pytest.fixture(scope="module")
@@ -98,9 +99,9 @@ def test_order_does_not_matter(twin, mixed, found):
 def test_nor_does_how_many_are_weighed_at_a_time(twin, mixed, monkeypatch):
     some = mixed.isel(run=slice(0, 5))
     monkeypatch.setattr(runs_together, "CHUNK_RUNS", 2)
-    theta, log_posterior, _ = judged(twin, some, priors=SURE)
+    theta, log_posterior, _ = judged(twin, some, FEW, SURE)
     monkeypatch.undo()
-    whole_set, expected, _ = judged(twin, some, priors=SURE)
+    whole_set, expected, _ = judged(twin, some, FEW, SURE)
     assert len(theta.posteriors) == 3
     np.testing.assert_allclose(np.exp(log_posterior), np.exp(expected), atol=1e-3)
     np.testing.assert_allclose(theta.mean / WIDTH, whole_set.mean / WIDTH, atol=3e-3)
@@ -116,11 +117,11 @@ def test_later_passes_change_nothing_that_matters(twin, mixed, found, monkeypatc
 
 def test_early_ones_do(twin, mixed, monkeypatch):
     """Normal are wide until it is known which motor is faulty; a second look narrows them."""
-    found = {}
+    found, some = {}, mixed.isel(run=slice(None, None, 2))
     for passes in (3, 6, 12):
         monkeypatch.setattr(folder, "PASSES", passes)
         monkeypatch.setattr(folder, "MOST_PASSES", passes)
-        found[passes], *_ = judged(twin, mixed.isel(run=slice(None, None, 2)), priors=SURE)
+        found[passes], *_ = judged(twin, some, FEW, SURE)
     off = {n: np.abs((found[n].mean - found[12].mean) / found[12].deviation)[7:] for n in (3, 6)}
     assert off[6].max() < 0.4
     assert off[3].max() > off[6].max()
@@ -132,7 +133,7 @@ def test_one_run_alone_is_judged_with_the_prior(twin, mixed, monkeypatch):
     monkeypatch.setattr(habits, "TAIL_SPREAD", 1e-6)
     for run in range(0, 8, 2):  # one of each truth
         alone = mixed.isel(run=[run])
-        theta, log_posterior, names = judged(twin, alone, priors=SURE)
+        theta, log_posterior, names = judged(twin, alone, FEW, SURE)
         seen = theta.posteriors[0].likelihood
         model = HealthyModel(twin, replace(KNOWN, variation=DOUBT))
         seen = replace(seen, model=model, remembered=None)
@@ -176,9 +177,10 @@ def test_no_healthy_run_is_needed(twin, armpi):
 
 def test_a_run_that_is_faulty_teaches_less(twin, armpi):
     """Its motor says nothing; the motor that is stuck in all of them keeps its prior."""
-    theta, *_ = judged(twin, runs_of(armpi, ["healthy", "motor_2:stuck"], 4, **OFF), priors=SURE)
+    few = [*FEW, Hypothesis.parse("motor_3:stuck")]
+    theta, *_ = judged(twin, runs_of(armpi, ["healthy", "motor_2:stuck"], 4, **OFF), few, SURE)
     assert theta.taught[:4].mean() > theta.taught[4:].mean() > 0.1
-    theta, *_ = judged(twin, runs_of(armpi, ["motor_3:stuck"], 4, **OFF), priors=SURE)
+    theta, *_ = judged(twin, runs_of(armpi, ["motor_3:stuck"], 4, **OFF), few, SURE)
     narrowed = theta.deviation / theta.prior_deviation
     assert narrowed[[7, 8]].max() < 0.6
     assert narrowed[9] > 0.7

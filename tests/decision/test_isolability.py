@@ -194,17 +194,16 @@ def test_expected_falls_are_those_of_simulated_scatter(square):
 
 
 @pytest.fixture(scope="module")
-def real_motions(armpi, measured_armpi):
-    """Random motions of the imperfect arm, and what they can tell of steady-state errors."""
-    plan = Plan(armpi, [HEALTHY], 12, 3, measured_armpi)
-    runs = simulate(plan)
-    return runs["command"].values, runs["time"].values
+def of_real_motions(twin, armpi, measured_armpi):
+    """What random motions of the imperfect arm can tell of steady-state errors."""
+    runs = simulate(Plan(armpi, [HEALTHY], 8, 3, measured_armpi))
+    return isolability(twin, runs["command"].values, runs["time"].values, measured_armpi)
 
 
 def test_faults_above_the_smallest_size_are_found_and_those_well_below_are_not(
-    twin, armpi, measured_armpi, real_motions
+    twin, armpi, measured_armpi, of_real_motions
 ):
-    smallest = isolability(twin, *real_motions, measured_armpi).isolated
+    smallest = of_real_motions.isolated
     diagnoser = BayesDiagnoser(twin, measured_armpi)
 
     def right(factor):
@@ -212,7 +211,7 @@ def test_faults_above_the_smallest_size_are_found_and_those_well_below_are_not(
         for name, size in smallest.items():
             low = 0.9 * factor * size
             modes = {**MODES, "steady_state_error": SteadyStateError(magnitude=(low, low / 0.81))}
-            some.append(simulate(Plan(armpi, faults(name)[1:], 6, 4, measured_armpi, modes=modes)))
+            some.append(simulate(Plan(armpi, faults(name)[1:], 5, 4, measured_armpi, modes=modes)))
         found = diagnoser.diagnose(xr.concat(some, "run"))
         return np.mean([d.diagnosis == d.truth for d in found])
 
@@ -220,8 +219,8 @@ def test_faults_above_the_smallest_size_are_found_and_those_well_below_are_not(
     assert right(0.4) <= 0.2
 
 
-def test_stuck_motors_of_real_motions_are_told_apart(twin, armpi, measured_armpi, real_motions):
-    found = isolability(twin, *real_motions, measured_armpi)
+def test_stuck_motors_of_real_motions_are_told_apart(armpi, of_real_motions):
+    found = of_real_motions
     assert found.hypotheses == tuple(map(str, paper_hypotheses(armpi.motor_names)))
     assert found.groups == ()
     for by_fault in (found.detected, found.isolated, found.typical, found.largest):

@@ -37,7 +37,7 @@ def toy(runs=96, seed=0):
     return features, classes
 
 
-def learn(name, seed=0, iterations=120):
+def learn(name, seed=0, iterations=60):
     features, classes = toy()
     torch.manual_seed(seed)
     network = build_network(name, SHAPE)

@@ -177,7 +177,7 @@ def test_straight_lines_between_readings_are_no_evidence(twin, motions, all_mode
     seed=st.integers(0, 10**6),
     gaps=st.lists(st.tuples(st.floats(0.0, 9.0), st.floats(0.3, 4.0)), min_size=1, max_size=3),
 )
-@settings(max_examples=2)
+@settings(max_examples=1)
 def test_straight_lines_across_gaps_are_no_evidence(all_modes, runs, seed, gaps):
     """Of a sensor that flickers by a millimetre, whose readings stop anywhere; lines run on to both
     ends of the run, as if the first and the last reading were held."""
@@ -199,6 +199,7 @@ def test_straight_lines_over_stalls_are_no_evidence(armpi, twin, known):
     units = replace(armpi.profile.servo_units, noise=0.0)
     quiet = replace(armpi, profile=replace(armpi.profile, servo_units=units))
     lone = simulate(Plan(quiet, paper_hypotheses(armpi.motor_names), 1, 5, known))
+    lone = lone.isel(run=slice(None, None, 2))
     expected = BayesDiagnoser(twin).diagnose(lone)
     remarks = [[q for q in d.quality if "no readings from" in q] for d in expected]
     assert sum(map(bool, remarks)) > 1

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -39,24 +41,35 @@ def watcher(twin):
     return monitor(twin, NO_IMPERFECTIONS)
 
 
+def work_of(twin, rng, movements, stuck=()):
+    """Return samples of a healthy, exact arm: a random movement every two seconds, seen at 10 Hz.
+
+    Each of `stuck` is a motor, and the movements in which it stays where it is.
+    """
+    low, high = np.array([motor.movement_range for motor in twin.robot.motors]).T
+    target = rng.uniform(0.5 * low, 0.5 * high, (1, movements, len(low)))
+    start = 0.5 + PERIOD_S * np.arange(movements)[None]
+    commanded = Movements(np.zeros((1, len(low))), target, np.full(target.shape, 0.8), start)
+    time = np.arange(round((0.5 + PERIOD_S * movements) / STEP_S)) * STEP_S
+    reference = commanded.reference(time)[0]
+    angles = reference.copy()
+    for motor, first, last in stuck:
+        begin, end = (0.3 + PERIOD_S * number for number in (first, last))
+        inside = (time >= begin) & (time < end)
+        angles[inside, motor] = angles[np.argmax(inside), motor]
+    points = twin.path(angles) + rng.normal(0.0, 3e-4, (len(time), 3))
+    return list(zip(time.tolist(), reference, points, strict=True))
+
+
 @pytest.fixture
 def work(twin, rng):
-    """A healthy, exact arm at work: random movements every two seconds, readings at 10 Hz."""
+    """Make samples of an arm at work."""
+    return partial(work_of, twin, rng)
 
-    def samples(movements, stuck=()):
-        count, motors = movements, len(twin.robot.motors)
-        low, high = np.array([motor.movement_range for motor in twin.robot.motors]).T
-        target = rng.uniform(0.5 * low, 0.5 * high, (1, count, motors))
-        start = 0.5 + PERIOD_S * np.arange(count)[None]
-        commanded = Movements(np.zeros((1, motors)), target, np.full(target.shape, 0.8), start)
-        time = np.arange(round((0.5 + PERIOD_S * count) / STEP_S)) * STEP_S
-        reference = commanded.reference(time)[0]
-        angles = reference.copy()
-        for motor, first, last in stuck:
-            begin, end = (0.3 + PERIOD_S * number for number in (first, last))
-            inside = (time >= begin) & (time < end)
-            angles[inside, motor] = angles[np.argmax(inside), motor]
-        points = twin.path(angles) + rng.normal(0.0, 3e-4, (len(time), 3))
-        return list(zip(time.tolist(), reference, points, strict=True))
 
-    return samples
+@pytest.fixture(scope="session")
+def told_of_repaired(twin):
+    """Answers about an exact arm whose motor 2 is stuck from movement 6 to movement 12 of 24."""
+    watch = monitor(twin, NO_IMPERFECTIONS)
+    samples = work_of(twin, np.random.default_rng(0), 24, [(1, 6, 12)])
+    return [watch.update(*sample) for sample in samples]

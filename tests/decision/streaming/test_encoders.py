@@ -36,7 +36,7 @@ def reported(work, twin, rng):
 
 def test_a_healthy_arm_raises_nothing(twin, reported):
     watch = monitor(twin, sensing="tool+encoders")
-    told = [watch.update(*sample) for sample in reported(14)]
+    told = [watch.update(*sample) for sample in reported(9)]
     assert {answer.alarm.state for answer in told} == {CLEAR}
     assert told[-1].diagnosis.diagnosis == "healthy"
 
@@ -47,7 +47,7 @@ def test_an_error_of_the_last_motor_shows_sooner(twin, reported):
     for sensing in ("tool", "tool+encoders"):
         diagnoser = BayesDiagnoser(twin, hypotheses=FEW, whole_run=False, sensing=sensing)
         watch = FaultMonitor(diagnoser)
-        told = [watch.update(*sample) for sample in samples]
+        told = (watch.update(*sample) for sample in samples)
         at = next(answer for answer in told if answer.alarm.state == RAISED)
         raised[sensing] = at.time
         assert at.alarm.cause == "motor_4:steady_state_error"

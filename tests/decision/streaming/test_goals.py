@@ -53,10 +53,10 @@ def test_a_healthy_arm_raises_nothing(twin, reported):
 
 def test_a_stuck_motor_that_received_its_goal_is_named_within_a_movement(twin, reported):
     """From the tool alone it may as well have lost its commands."""
-    samples, raised = reported(15, stays_from=6), {}
+    samples, raised = reported(13, stays_from=4), {}
     for sensing in ("tool", "tool+goals"):
         watch = watching(twin, sensing)
-        told = [watch.update(*sample) for sample in samples]
+        told = (watch.update(*sample) for sample in samples)
         at = next(answer for answer in told if answer.alarm.state == RAISED)
         assert at.alarm.cause == "motor_1:stuck"
         raised[sensing] = (at.time - 0.5 - 2.04 * 6) / 2.04

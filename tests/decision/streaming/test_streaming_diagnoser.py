@@ -24,32 +24,33 @@ PERIOD_S = 2.04
 STEP_S = 0.1
 
 
-def said(diagnoser, samples):
+def rows_of(answers):
     """Return the time of each answer and the probabilities of healthy and of motor 2 stuck."""
     rows = []
-    for sample in samples:
-        answer = diagnoser.update(*sample)
+    for answer in answers:
         if answer.diagnosis is not None:
             posterior = answer.diagnosis.posterior
             rows.append((answer.time, posterior["healthy"], posterior["motor_2:stuck"]))
     return np.array(rows)
 
 
-def test_a_late_fault_is_found_as_fast_as_an_early_one(twin, work):
-    """The movements after the onset, until it is sure, are as few after 16 as after 5."""
-    delays = []
-    for first in (5, 16):
-        rows = said(monitor(twin, NO_IMPERFECTIONS), work(first + 6, stuck=[(1, first, first + 6)]))
-        onset = 0.5 + PERIOD_S * first
-        sure = rows[(rows[:, 2] > 0.9) & (rows[:, 0] > onset), 0]
-        delays.append(sure[0] - onset)
-        assert (rows[rows[:, 0] < onset, 1] > 0.5).all()
-    assert delays[1] < delays[0] + 1.5 * PERIOD_S
-    assert max(delays) < 4 * PERIOD_S
+def delay(rows, first):
+    """Return the time from the onset until it is sure [s]; before it no fault is probable."""
+    onset = 0.5 + PERIOD_S * first
+    assert (rows[rows[:, 0] < onset, 1] > 0.5).all()
+    return rows[(rows[:, 2] > 0.9) & (rows[:, 0] > onset), 0][0] - onset
 
 
-def test_a_repaired_robot_becomes_healthy_again(watcher, work):
-    rows = said(watcher, work(20, stuck=[(1, 6, 12)]))
+def test_a_late_fault_is_found_as_fast_as_an_early_one(told_of_repaired, watcher, work):
+    """The movements after the onset, until it is sure, are as few after 16 as after 6."""
+    early = delay(rows_of(told_of_repaired), 6)
+    late = delay(rows_of(watcher.update(*s) for s in work(20, stuck=[(1, 16, 20)])), 16)
+    assert late < early + 1.5 * PERIOD_S
+    assert max(late, early) < 4 * PERIOD_S
+
+
+def test_a_repaired_robot_becomes_healthy_again(told_of_repaired):
+    rows = rows_of(told_of_repaired)
     repaired = 0.5 + PERIOD_S * 12
     assert rows[rows[:, 0] < repaired, 2].max() > 0.9
     after = rows[rows[:, 0] > repaired + 5.5 * PERIOD_S]
@@ -57,15 +58,15 @@ def test_a_repaired_robot_becomes_healthy_again(watcher, work):
 
 
 def test_the_onset_of_an_old_fault_stands(watcher, work):
-    diagnoser, samples = watcher, work(14, stuck=[(1, 6, 14)])
+    diagnoser, samples = watcher, work(11, stuck=[(1, 4, 11)])
     for sample in samples:
         answer = diagnoser.update(*sample)
     assert answer.diagnosis.diagnosis == "motor_2:stuck"
     low, high = answer.diagnosis.onset_90
-    onset = 0.5 + PERIOD_S * 6
+    onset = 0.5 + PERIOD_S * 4
     assert low - PERIOD_S < onset < high + PERIOD_S
     assert f"since {answer.diagnosis.onset_s:.1f} s" in answer.diagnosis.verdict
-    assert answer.diagnosis.evidence[-1].movement == 14
+    assert answer.diagnosis.evidence[-1].movement == 11
 
 
 def test_silence_is_stale_and_what_was_known_is_kept(watcher, work):
@@ -79,21 +80,15 @@ def test_silence_is_stale_and_what_was_known_is_kept(watcher, work):
     assert diagnoser.update(answer.time + 5.3, None, sample[2]).state == OK
 
 
-def test_a_frozen_sensor_is_never_healthy(watcher, work):
-    diagnoser, samples = watcher, work(12)
+def test_a_frozen_sensor_is_never_healthy_and_believed_again_when_it_comes_back(watcher, work):
+    samples = work(18)
     for time, command, point in samples:
-        frozen = samples[100][2] if time > 10.0 else point
-        answer = diagnoser.update(time, command, frozen)
-    assert answer.diagnosis.undecided.startswith("the tool stands still")
-    assert answer.diagnosis.posterior["healthy"] < 0.8  # the prior of who watches
-    assert answer.diagnosis.probability is None
-
-
-def test_a_sensor_that_comes_back_is_believed_again(watcher, work):
-    diagnoser, samples = watcher, work(24)
-    for time, command, point in samples:
-        frozen = samples[100][2] if 10.0 < time < 22.0 else point
-        answer = diagnoser.update(time, command, frozen)
+        answer = watcher.update(time, command, samples[100][2] if 10.0 < time < 20.0 else point)
+        if time < 20.0:
+            last = answer
+    assert last.diagnosis.undecided.startswith("the tool stands still")
+    assert last.diagnosis.posterior["healthy"] < 0.8  # the prior of who watches
+    assert last.diagnosis.probability is None
     assert answer.diagnosis.diagnosis == "healthy"
     assert answer.diagnosis.probability > 0.9
 
@@ -192,7 +187,7 @@ def test_between_two_judgements_nothing_said_changes(twin, work):
     """A fleet can be asked at any time, also while a movement is under way."""
     fleet = StreamingFleet(BayesDiagnoser(twin, NO_IMPERFECTIONS, whole_run=False), 1)
     said = None
-    for time, command, point in work(12, stuck=[(1, 4, 12)]):
+    for time, command, point in work(8, stuck=[(1, 3, 8)]):
         changed = fleet.update(time, command[None], point[None])
         found = fleet.diagnosis(0)
         if said is not None and not len(changed):
@@ -208,7 +203,7 @@ def test_a_stream_of_nothing_is_refused(twin, kwargs):
         StreamingFleet(BayesDiagnoser(twin), **kwargs)
 
 
-@pytest.mark.parametrize(("name", "rate_hz"), [("ur5e", 10.0), ("panda", 100.0), ("so101", 100.0)])
+@pytest.mark.parametrize(("name", "rate_hz"), [("ur5e", 10.0), ("so101", 100.0)])
 def test_other_arms_are_streamed_as_they_are_recorded(name, rate_hz):
     robot = load_robot(name)
     hypotheses = paper_hypotheses(robot.motor_names)

@@ -14,6 +14,9 @@ from failuretwin.data_knowledge.generate import simulate
 from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
+FEW = [0, 3, 6]
+"""Some of the nine states."""
+
 
 def posteriors(diagnoses):
     return np.array([list(diagnosis.posterior.values()) for diagnosis in diagnoses])
@@ -55,6 +58,12 @@ def nine_runs(live_runs):
 
 
 @pytest.fixture(scope="module")
+def few_runs(nine_runs):
+    """Healthy, stuck and with errors."""
+    return nine_runs.isel(run=FEW)
+
+
+@pytest.fixture(scope="module")
 def played(nine_runs, live_diagnoser):
     """A fleet that has seen them to their end, and its posteriors before it was told of that."""
     fleet = play(nine_runs, live_diagnoser)
@@ -80,9 +89,8 @@ def test_the_end_of_a_stream_is_the_batch(nine_runs, live_diagnoser, played):
 
 def test_robots_do_not_know_each_other(nine_runs, live_diagnoser, played):
     _, together = played
-    for robot in (0, 5):
-        alone = play(nine_runs, live_diagnoser, slice(robot, robot + 1)).posterior
-        np.testing.assert_allclose(alone[0], together[robot], rtol=0.0, atol=1e-12)
+    alone = play(nine_runs, live_diagnoser, slice(5, 6)).posterior
+    np.testing.assert_allclose(alone[0], together[5], rtol=0.0, atol=1e-12)
 
 
 def test_modes_that_show_on_the_way_count_in_streams(live_runs, twin):
@@ -96,15 +104,15 @@ def test_modes_that_show_on_the_way_count_in_streams(live_runs, twin):
     np.testing.assert_allclose(fleet.posterior, expected, rtol=0.0, atol=1e-9)
 
 
-def test_samples_may_come_late(nine_runs, live_diagnoser, rng):
+def test_samples_may_come_late(few_runs, live_diagnoser, rng):
     """Readings that arrive up to 0.1 s late, out of order, change nothing in the end."""
-    count, some = nine_runs.sizes["time"], nine_runs
+    count, some = few_runs.sizes["time"], few_runs
     order = np.argsort(np.arange(count) + rng.integers(0, 10, count), kind="stable")
     settled = BayesDiagnoser(live_diagnoser.twin, whole_run=False)
     # What is told late of commands is not taken up, so only readings are late here.
     time, command = some["time"].values, some["command"].values
     measured = some["measured"].values
-    fleet = StreamingFleet(of_named(settled), 9, some.attrs["measured_rate_hz"])
+    fleet = StreamingFleet(of_named(settled), len(FEW), some.attrs["measured_rate_hz"])
     for now, i in enumerate(order):
         fleet.update(time[now], command[:, now], None)
         fleet.update(time[i], None, measured[:, i])
@@ -112,9 +120,9 @@ def test_samples_may_come_late(nine_runs, live_diagnoser, rng):
     np.testing.assert_allclose(fleet.posterior, decided(settled, some), rtol=0.0, atol=1e-9)
 
 
-def test_missing_samples_are_no_evidence(nine_runs, live_diagnoser, rng):
+def test_missing_samples_are_no_evidence(few_runs, live_diagnoser, rng):
     """Readings that are lost on the way to the stream might as well not have been taken."""
-    some = nine_runs.copy(deep=True)
+    some = few_runs.copy(deep=True)
     lost = rng.random(some["measured"].shape[:2]) < 0.3
     some["measured"].values[lost] = np.nan
     fleet = play(some, live_diagnoser)
@@ -123,15 +131,15 @@ def test_missing_samples_are_no_evidence(nine_runs, live_diagnoser, rng):
     np.testing.assert_allclose(fleet.posterior, expected, rtol=0.0, atol=1e-9)
 
 
-def test_whole_samples_may_be_missing(nine_runs, live_diagnoser, played, rng):
+def test_whole_samples_may_be_missing(few_runs, live_diagnoser, played, rng):
     """Commands are known as well from fewer samples: their corners are found between them."""
     whole, _ = played
-    kept = rng.random(nine_runs.sizes["time"]) < 0.8
-    read = np.isfinite(nine_runs["measured"].values).all(axis=2).any(axis=0)
+    kept = rng.random(few_runs.sizes["time"]) < 0.8
+    read = np.isfinite(few_runs["measured"].values).all(axis=2).any(axis=0)
     kept[:30] = True
-    fewer = play(nine_runs, live_diagnoser, skip=set(np.flatnonzero(~kept & ~read).tolist()))
+    fewer = play(few_runs, live_diagnoser, skip=set(np.flatnonzero(~kept & ~read).tolist()))
     fewer.conclude()
-    np.testing.assert_allclose(fewer.posterior, whole.posterior, atol=0.02)
+    np.testing.assert_allclose(fewer.posterior, whole.posterior[FEW], atol=0.02)
 
 
 def test_silence_is_told(live_runs, live_diagnoser):
