@@ -140,13 +140,15 @@ def test_widened_robots_differ_more(armpi):
 
 def test_a_network_is_trained_and_pooled_with_bayes_in_one_call(armpi, measured_armpi, monkeypatch):
     monkeypatch.setattr(stream_module, "CHUNK_RUNS", 64)
-    plan = TrainingPlan(iterations=2, validation_runs=18)
+    asked = tuple(h for h in paper_hypotheses(armpi.motor_names) if "error" not in str(h))
+    plan = TrainingPlan(iterations=2, validation_runs=18, hypotheses=asked)
     both = train(armpi, measured_armpi, plan, with_bayes=True)
     assert isinstance(both, HybridDiagnoser)
     assert both.weights == both.network.weights_
     runs = simulate(Plan(armpi, paper_hypotheses(armpi.motor_names)[:1], 1, 2, measured_armpi))
     (diagnosis,) = both.diagnose(runs)
     assert diagnosis.method.startswith("blended: bayes")
+    assert set(diagnosis.posterior) == set(map(str, asked))
 
 
 def test_the_command_trains_as_much_as_python_does():

@@ -85,9 +85,18 @@ def train(
     network, _, _ = train_network(plan, known)
     if not with_bayes:
         return network
-    return HybridDiagnoser(
-        BayesDiagnoser(known), network, network.weights_, class_name(known.robot)
-    )
+    return _pooled(_bayes_of(known, network), network, known)
+
+
+def _bayes_of(known: CalibratedRobot, network: MotorwiseDiagnoser) -> BayesDiagnoser:
+    """Return the Bayesian diagnosis of a robot, by the classes of its network."""
+    return BayesDiagnoser(known, hypotheses=[str(name) for name in network.classes_])
+
+
+def _pooled(
+    bayes: BayesDiagnoser, network: MotorwiseDiagnoser, known: CalibratedRobot
+) -> HybridDiagnoser:
+    return HybridDiagnoser(bayes, network, network.weights_, class_name(known.robot))
 
 
 @dataclass(frozen=True)
@@ -150,7 +159,7 @@ def train_network(
     exams = [_exam(plan, data, network, at) for at in range(len(robots))]
     _calibrate(network, exams)
     first = exams[0]
-    both = HybridDiagnoser(first.bayes, network, network.weights_, class_name(known.robot))
+    both = _pooled(first.bayes, network, known)
     alone, pooled = (Judged.of(d.diagnose(first.judges)).scores for d in (network, both))
     return network, alone, pooled
 
@@ -160,7 +169,7 @@ def _exam(plan: TrainingPlan, data: PopulationData, network: MotorwiseDiagnoser,
     other = replace(data, seed=plan.seed + VALIDATION_SEED, engine="physics", widening=(1.0,))
     arm, half = data.robots[at], plan.validation_runs // 2 // len(data.robots)
     own = network.for_robot(MomentEncoder(arm.robot, arm.imperfections))
-    bayes = BayesDiagnoser(arm, hypotheses=[str(name) for name in own.classes_])
+    bayes = _bayes_of(arm, own)
     judges = other.run_set(at + len(data.robots), half)
     return _Exam(own, bayes, other.run_set(at, half), judges)
 
