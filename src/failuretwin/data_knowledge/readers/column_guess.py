@@ -199,7 +199,8 @@ class _Guessed(Table):
         named = self.named_unit(columns, ANGLE_NAMES)
         if named or not columns:
             return named or "rad"
-        size = float(np.nanmedian(np.abs(self.values(columns))))
+        values = np.abs(self.values(columns))
+        size = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
         if robot.profile.servo_units is not None and size > 180.0:
             return SERVO
         return "deg" if self.largest(columns) > LARGEST_RAD else "rad"

@@ -320,10 +320,14 @@ def theta_of_picks(
     return ThetaPart(h, places, picks, weight[places], mean, covariance)
 
 
-def most_probable_theta(evidence: RunsEvidence) -> tuple[IntArray, FloatArray]:
-    """Return the most probable hypothesis of each run, (run,), and its mean of theta.
+def most_probable_theta(evidence: RunsEvidence, among: BoolArray) -> tuple[IntArray, FloatArray]:
+    """Return the most probable of some hypotheses for each run, (run,), and its mean of theta.
 
     Theta is that of its most probable row and component, (run, theta).
+
+    Args:
+        evidence: The runs.
+        among: Which hypotheses, (hypothesis,).
     """
     runs, count = evidence.scene.moments.runs, len(evidence.hypotheses)
     best, place = np.full((runs, count), -np.inf), np.zeros((runs, count), dtype=np.int64)
@@ -332,7 +336,8 @@ def most_probable_theta(evidence: RunsEvidence) -> tuple[IntArray, FloatArray]:
         order = np.argsort(height, kind="stable")
         run = one.picks.run[order]
         best[run, h], place[run, h] = height[order], order
-    likely = (evidence.by_hypothesis + evidence.log_odds).argmax(axis=1)
+    height = np.where(among, evidence.by_hypothesis + evidence.log_odds, -np.inf)
+    likely = height.argmax(axis=1)
     theta = np.zeros((runs, evidence.scene.layout.size))
     for h in np.unique(likely).tolist():
         rows = np.flatnonzero(likely == h)

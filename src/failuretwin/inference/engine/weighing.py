@@ -125,8 +125,12 @@ class Weighing:
 
     @cached_property
     def best(self) -> tuple[IntArray, FloatArray]:
-        """The most probable hypothesis with rows of each run, and its mean of theta."""
-        return most_probable_theta(self.evidence)
+        """The most probable hypothesis of each run that node sums know too, and its mean of theta.
+
+        They do not know what late and slow motors do on the way.
+        """
+        known = np.array([has_rows(self.hypotheses[i]) for i in self.with_rows])
+        return most_probable_theta(self.evidence, known)
 
     @cached_property
     def at_best(self) -> RunLikelihood:

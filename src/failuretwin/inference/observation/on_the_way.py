@@ -140,9 +140,10 @@ def on_the_way(evidence: Evidence, model: HealthyModel, lag_s: float) -> Settled
     settled, curves = evidence.settled, long_curves(evidence)
     strays = told_too_seldom(evidence, model, lag_s)
     hardly = hardly_rest(evidence, model) & ~strays
-    unseen = settled.movements.exists & ~settled.usable & _few_rests(evidence, model)[:, None]
+    rests = settled.usable & ~(_arriving(settled, lag_s) & hardly[:, None])
+    unseen = settled.movements.exists & ~rests & _few_rests(evidence, model)[:, None]
     unseen = (unseen | curves) & hardly[:, None]
-    seen = settled.usable & ~(curves & strays[:, None])
+    seen = rests & ~(curves & strays[:, None])
     settled = replace(settled, usable=seen, too_seldom=strays)
     if not unseen.any():
         return settled
@@ -151,6 +152,16 @@ def on_the_way(evidence: Evidence, model: HealthyModel, lag_s: float) -> Settled
     if not any(found.values()):
         return settled
     return _joined(settled, found, lag_s)
+
+
+def _arriving(settled: SettledEvidence, lag_s: float) -> BoolArray:
+    """Return the movements whose tool still arrives when readings count as rest, (run, movement).
+
+    It trails its commands by more than it takes to settle, such as where clocks are apart.
+    """
+    movements = settled.movements
+    ends = movements.start + movements.ramp_duration.max(axis=-1, initial=0.0)
+    return np.asarray(settled.begin < ends + lag_s)
 
 
 @dataclass(frozen=True)
