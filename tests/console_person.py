@@ -14,6 +14,8 @@ PICTURES = os.environ.get("FAILURETWIN_PICTURES")
 """Folder for the pictures of README and docs; empty: none are taken."""
 LONGEST_S = 500.0
 """Longest wait [s]: ends what hangs, not what is slow."""
+LOOK_S = 0.25
+"""Time between two looks at a page [s]: each makes the browser work."""
 
 
 class Person:
@@ -30,7 +32,7 @@ class Person:
         deadline = time.monotonic() + LONGEST_S
         while not (found := self.browser.find_elements("xpath", xpath)):
             assert time.monotonic() < deadline, f"{xpath} is not there: {self.text[:2000]}"
-            time.sleep(0.1)
+            time.sleep(LOOK_S)
         return found[0]
 
     def click(self, words):
@@ -60,7 +62,12 @@ class Person:
 
     def sees(self, *words):
         """Wait until words are there."""
-        self.waits(lambda: all(one in self.text for one in words), words)
+
+        def seen():
+            text = self.text
+            return all(one in text for one in words)
+
+        self.waits(seen, words)
 
     def waits(self, truth, words=""):
         """Wait until something holds; a page may be drawn anew meanwhile."""
@@ -70,7 +77,7 @@ class Person:
                 if truth():
                     return
             assert time.monotonic() < deadline, f"{words} in vain: {self.text[:2000]}"
-            time.sleep(0.1)
+            time.sleep(LOOK_S)
 
     def sign_in(self, name, password):
         self.go("/login")

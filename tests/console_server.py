@@ -25,7 +25,7 @@ PASSWORD = "correct horse"
 USERS = {"ada": "move", "eve": "see"}
 
 
-DEMO = ("--demo", "--demo-robots", "0", "--speed", "2")
+DEMO = ("--demo", "--demo-robots", "0", "--speed", "1")
 
 
 class ConsoleServer:

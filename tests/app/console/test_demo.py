@@ -15,6 +15,7 @@ import pytest
 pytest.importorskip("nicegui")
 pytest.importorskip("selenium", reason="selenium is not installed")
 
+import failuretwin as ft
 from console_person import PICTURES, Person
 from console_server import ConsoleServer
 from waiting import wait_for
@@ -23,7 +24,8 @@ TRACKED, SICK, LIVE = "hall_2-arm_9", "hall_2-arm_7", "hall_1-arm_2"
 THEN = "//label[span[text()='Then']]//option"
 ROBOTS = 9 if PICTURES else 1
 """Robots whose year is simulated: a full wall for the pictures."""
-OPTIONS = ("--demo", "--demo-robots", str(ROBOTS), "--speed", "1.5")
+OPTIONS = ("--demo", "--demo-robots", str(ROBOTS), "--speed", "0.5")
+"""Arms that move slowly leave the processor to the history that is waited for."""
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +120,8 @@ def test_a_demo_that_is_killed_leaves_nothing_behind(tmp_path):
     killed.kill()
     wait_for(lambda: ended(child))
     (left,) = folders.glob("failuretwin-console-*")
-    again = ConsoleServer(tmp_path, ("--demo", "--demo-robots", "0"), own)
+    ft.open_store(tmp_path / "robots.db", create=True)
+    again = ConsoleServer(tmp_path, ("--store", "robots.db"), own)
     assert not left.exists()
     assert len(list(folders.glob("failuretwin-console-*"))) == 1
     again.stop()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 from contextlib import ExitStack
@@ -29,14 +30,19 @@ from failuretwin.inference.diagnoser import BayesDiagnoser
 
 DAY_S = 86_400
 LOW_PRIORITY = 5
-CHILD = """import os, threading
+CHILD = """import os, shlex, sys, threading
 def end_with_parent():
     os.read(0, 1)
     os._exit(1)
 threading.Thread(target=end_with_parent, daemon=True).start()
 from failuretwin.app.cli import main
-main()"""
-"""Runs a command. Its input ends when its parent does, however that ends; then it ends too."""
+for command in sys.argv[1:]:
+    sys.argv[1:] = shlex.split(command)
+    main()"""
+"""Runs commands, one after the other: libraries are imported and compiled code is loaded once.
+
+Its input ends when its parent does, however that ends; then it ends too.
+"""
 YEAR_SEED = 5
 ARMS = {
     "hall_1-arm_1": ((), 0.0),
@@ -49,8 +55,8 @@ LOGS = {
     "hall_2-arm_8": (("thursday", 1),),
 }
 """Logs of robots: name and number of the simulated run. The last two are of a stuck motor."""
-TRACKED, TRACKED_RUNS, TRACKED_SEED = "hall_2-arm_9", 24, 3
-"""Robot whose offsets are followed over two logs, for its remaining life; its runs."""
+TRACKED, TRACKED_RUNS, TRACKED_SEED = "hall_2-arm_9", 20, 3
+"""Robot whose offsets are followed over two logs; as many runs as its remaining life needs."""
 REVERSED = {"hall_2-arm_8": 1}
 """Robots whose set-up is wrong: the number of the motor whose commands have the other sign."""
 
@@ -94,7 +100,7 @@ _COMMANDED = ("command", "target")
 
 @dataclass
 class HistoryWriter:
-    """Writes the past of the demo into its store, in processes that give way to the pages.
+    """Writes the past of the demo into its store, in a process that gives way to the pages.
 
     Attributes:
         store: The store.
@@ -126,10 +132,10 @@ class HistoryWriter:
 
     def _write(self) -> None:
         stored = ["--store", self.store.name]
-        for log in self._tracked_logs():
-            self._run("diagnose", str(log), "--track", "--robot-name", TRACKED, *stored)
+        followed = ["--track", "--robot-name", TRACKED, *stored]
         fleet = ["--fleet", str(self.robots), "--years", "1", "--seed", str(YEAR_SEED)]
-        self._run("simulate", *fleet, *stored)
+        commands = [["diagnose", str(log), *followed] for log in self._tracked_logs()]
+        self._run(*commands, ["simulate", *fleet, *stored])
 
     def _tracked_logs(self) -> list[Path]:
         """Write the logs of the robot that is followed, and return them."""
@@ -143,11 +149,12 @@ class HistoryWriter:
             paths.append(path)
         return paths
 
-    def _run(self, *arguments: str) -> None:
-        """Run a command to its end, unless all is stopped."""
+    def _run(self, *commands: list[str]) -> None:
+        """Run commands to their end, unless all is stopped."""
         if self._stopped:
             return
-        command, quiet = [sys.executable, "-c", CHILD, *arguments], subprocess.DEVNULL
+        words, quiet = map(shlex.join, commands), subprocess.DEVNULL
+        command = [sys.executable, "-c", CHILD, *words]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=quiet, stderr=quiet)
         os.setpriority(os.PRIO_PROCESS, self._process.pid, LOW_PRIORITY)
