@@ -24,6 +24,7 @@ columns = ["a", "b", "c"]
 unit = "m"
 """
 SICK, LIVE, SILENT, DOUBTED = "hall_2-arm_7", "hall_1-arm_2", "hall_1-arm_3", "hall_2-arm_8"
+TUESDAY = "//tr[td[normalize-space()='tuesday']]"
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +74,7 @@ def test_why_a_stored_robot_is_sick_and_the_moment_replayed(person):
     person.sees(SICK)
     person.press(f"//a[strong[text()='{SICK}']]")
     person.sees("What to do now", "Cut the power", "motor 3 stuck")
-    person.press("//tr[td[normalize-space()='tuesday']]//a")
+    person.press(TUESDAY + "//a")
     person.sees("movement 4:", "possible causes", "What to do now")
     person.press("//button[contains(., 'movement 4:')]")
     person.waits(lambda: float(person.find("//p[@role='status']").text.split()[0]) > 3.0)
@@ -187,7 +188,10 @@ def post(url, fields, session="", headers=None):
 def test_the_pages_have_no_serious_finding_of_axe(person):
     axe = pytest.importorskip("axe_selenium_python", reason="axe-selenium-python is missing")
     found = {}
-    pages = ("/", f"/robot?name={LIVE}", f"/history?name={SICK}", "/check", "/import")
+    person.go(f"/robot?name={SICK}")
+    replay = person.find(TUESDAY + "//a[normalize-space()='Replay']").get_attribute("href")
+    replay = replay.removeprefix(person.url)
+    pages = ("/", f"/robot?name={LIVE}", f"/history?name={SICK}", replay, "/check", "/import")
     for page in pages:
         person.go(page)
         person.find("//main//h1")
