@@ -69,9 +69,9 @@ def test_priors_that_a_store_teaches_count_as_in_memory(failuretwin, tmp_path, t
     assert all(many.method.str.endswith("; learned priors"))
 
 
-def test_a_robot_is_learned_from_a_sample_and_judges_each_run(failuretwin, tmp_path, simulated):
+def test_a_robot_is_learned_from_a_sample_and_judges_each_run(failuretwin, tmp_path, three):
     """Against the calibration file that the same runs teach in memory, and its diagnoses."""
-    of = ("diagnose", simulated, *TWO[:2])
+    of = ("diagnose", three, *TWO[:2])
     assert (
         failuretwin(*of, "--self-calibrate", "--out", "own.toml", folder=tmp_path).returncode == 0
     )
@@ -79,7 +79,7 @@ def test_a_robot_is_learned_from_a_sample_and_judges_each_run(failuretwin, tmp_p
     assert wanted.returncode == 0, wanted.stderr
     told = failuretwin(*of, "--self-calibrate", "--parquet", "many", folder=tmp_path)
     assert told.returncode == 0, told.stderr
-    assert "self-calibrated by 9 runs, evenly spread; each run is judged by" in told.stdout
+    assert "self-calibrated by 3 runs, evenly spread; each run is judged by" in told.stdout
     many = pd.read_parquet(tmp_path / "many")
     found = many["p(healthy)"].to_numpy()
     assert found == pytest.approx(pd.read_csv(tmp_path / "own.csv")["p(healthy)"], abs=0.01)

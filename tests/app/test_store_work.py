@@ -324,7 +324,7 @@ def test_a_self_calibration_begins_with_that_of_the_store(run, place, calibrated
 
 @on_postgresql
 def test_a_watch_goes_on_from_what_earlier_ones_have_learned(run, place, store):
-    words = ("watch", "emulated", "--speed", 0, "--seconds", 40, "--calibration", "generic")
+    words = ("watch", "emulated", "--speed", 0, "--seconds", 25, "--calibration", "generic")
     first = run(*words, "--track", "--store", place.url, *NAME)
     assert "0 runs of movements known before" in first.stdout
     ((known,),) = place.sql("SELECT max(runs) FROM beliefs")
@@ -354,7 +354,7 @@ def test_a_killed_watch_keeps_what_it_has_learned(run, file, tmp_path):
         ((known,),) = rows.execute("SELECT sum(json_array_length(rows)) FROM beliefs")
         ((learned,),) = rows.execute("SELECT max(runs) FROM beliefs")
     assert known == 1 <= learned
-    again = run(*words, "--seconds", 40)
+    again = run(*words, "--seconds", 25)
     assert f"{learned} runs of movements known before" in again.stdout
     with closing(sqlite3.connect(file)) as rows:
         counts = [one[0] for one in rows.execute("SELECT runs FROM beliefs ORDER BY id")]
