@@ -26,7 +26,7 @@ TOOL = np.array([0.0, 0.0, 0.05])
 
 def forward(q, dh=UR5, tool=TOOL):
     """Return tool points (pose, 3) of angles (pose, joint) by the product of the DH matrices."""
-    q = np.column_stack([q, np.zeros((len(q), 6 - q.shape[1]))])
+    q = np.column_stack([q, np.zeros((len(q), len(dh[0]) - q.shape[1]))])
     frame = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     for j, (a, d, alpha) in enumerate(zip(*dh, strict=True)):
         c, s, ca, sa = np.cos(q[:, j]), np.sin(q[:, j]), np.cos(alpha), np.sin(alpha)
