@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import failuretwin as ft
-from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.arm_classes import generic_imperfections
@@ -19,6 +19,8 @@ from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 
 ENDLESS = RandomMovements(count=6, period_s=1.2, ramp_shares=(1.0,))
+FAULTS = ["motor_2:stuck", "motor_3:steady_state_error"]
+OFFERED = ["healthy", *FAULTS, "motor_2:steady_state_error", "motor_3:stuck", "motor_4:stuck"]
 
 
 def weighed(robot, runs, times, share):
@@ -28,7 +30,8 @@ def weighed(robot, runs, times, share):
     diagnoser = ft.BayesDiagnoser(robot, lossy)
     seen = diagnoser.seen(runs)
     likelihood = RunLikelihood(seen.settled, seen.healthy)
-    weighing = robot_weighing(likelihood, paper_hypotheses(robot.motor_names), Priors())
+    hypotheses = [Hypothesis.parse(name, robot.motor_names) for name in OFFERED]
+    weighing = robot_weighing(likelihood, hypotheses, Priors())
     return replace(weighing, components=replace(weighing.components, lossy=share))
 
 
@@ -43,8 +46,7 @@ def test_shares_of_outcomes_say_what_other_weights_say(name, movements):
     own = with_rates(generic_imperfections(robot), LOSSY)
     if movements is not None:
         own = replace(own, schedule=Schedule(period_s=(1.2, 1.2)))
-    faults = ["healthy", "motor_2:stuck", "motor_3:steady_state_error"]
-    runs = simulate(Plan(robot, faults, 6, 4, imperfections=own, movements=movements))
+    runs = simulate(Plan(robot, OFFERED[:3], 6, 4, imperfections=own, movements=movements))
     usual, more, both = (
         weighed(robot, runs, *told).evidence for told in ((1.0, 0.0), (LOSSY, 0.0), (1.0, share))
     )
