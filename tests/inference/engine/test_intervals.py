@@ -21,7 +21,8 @@ def judged(imperfections, robot, mode, count, **faults):
     modes = {**MODES, mode: replace(MODES[mode], **faults)}
     names = [f"{motor}:{mode}" for motor in MOTORS]
     runs = simulate(Plan(robot, names, count, 5, imperfections, modes=modes))
-    found = ft.BayesDiagnoser(robot, imperfections).diagnose(runs)
+    among = list(dict.fromkeys(["healthy", *names, "motor_3:steady_state_error", "motor_3:stuck"]))
+    found = ft.BayesDiagnoser(robot, imperfections, hypotheses=among).diagnose(runs)
     right = [(d, run) for run, d in enumerate(found) if d.diagnosis == d.truth]
     assert len(right) > 0.8 * len(found)
     return right, runs
