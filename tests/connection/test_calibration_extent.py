@@ -29,8 +29,14 @@ def healthy_runs(robot, like, movements=None):
     return simulate(plan).drop_vars(LABELS, errors="ignore")
 
 
-def test_a_calibration_of_an_arm_that_never_rests_counts_moments(armpi, measured_armpi):
-    found = ft.calibrate(healthy_runs(armpi, measured_armpi, ENDLESS), armpi)
+@pytest.fixture(scope="module")
+def restless(armpi, measured_armpi):
+    """A calibration by runs without a rest, whose path is computed."""
+    return ft.calibrate(healthy_runs(armpi, measured_armpi, ENDLESS), armpi)
+
+
+def test_a_calibration_of_an_arm_that_never_rests_counts_moments(armpi, restless):
+    found = restless
     head = str(calibration_parts(found, armpi)[0])
     assert f"{found.movements} moments on the way of 4 runs" in head
     assert "settled" not in head
@@ -58,6 +64,5 @@ def test_what_was_learned_beside_joint_frames_counts_beside_them():
     assert has_geometry(ft.BayesDiagnoser(ur5e, found.imperfections).healthy_model)
 
 
-def test_a_path_that_is_computed_leaves_no_frame_in_doubt(armpi, measured_armpi):
-    found = ft.calibrate(healthy_runs(armpi, measured_armpi, ENDLESS), armpi)
-    assert not found.imperfections.frames_in_doubt
+def test_a_path_that_is_computed_leaves_no_frame_in_doubt(restless):
+    assert not restless.imperfections.frames_in_doubt
