@@ -168,7 +168,7 @@ def test_a_constant_error_in_every_run_is_not_swallowed(armpi, motor, size):
     """
     bias = tuple(size * (np.arange(4) == motor - 1))
     among = [*SOME, f"motor_{motor}:steady_state_error", f"motor_{motor}:stuck"]
-    runs = made(armpi, ["healthy"], 8, 2, bias=bias)
+    runs = made(armpi, ["healthy"], 5, 2, bias=bias)
     found = learned(armpi, runs, hypotheses=list(dict.fromkeys(among)))
     faulty = [d.diagnosis.startswith(f"motor_{motor}:") for d in found.diagnoses]
     odd = [line for line in found.remarks if f"bias of motor_{motor}: +" in line]
@@ -213,7 +213,7 @@ NOT_TOLD = "the runs do not tell it from what such robots differ by"
 )
 def test_a_sensor_that_stands_elsewhere_is_told(armpi, shift, turn_deg, away):
     """By 5 mm, or turned by 2 degrees about y, which moves this tool by about 8 mm."""
-    runs = made(armpi)
+    runs = made(armpi, each=2)
     turn = Rotation.from_rotvec([0.0, np.deg2rad(turn_deg), 0.0])
     seen = turn.apply(runs["measured"].values.reshape(-1, 3)).reshape(runs["measured"].shape)
     there = runs.assign(measured=(runs["measured"].dims, seen + shift))
