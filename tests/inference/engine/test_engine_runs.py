@@ -71,12 +71,14 @@ def uncalibrated(runs):
 def test_evidence_of_likely_rows_is_that_of_importance_sampling(uncalibrated):
     rng, off = np.random.default_rng(0), []
     height = uncalibrated.by_hypothesis + uncalibrated.log_odds
-    for run, h in enumerate(height.argmax(axis=1).tolist()):
+    likeliest = height.argmax(axis=1).tolist()
+    for run in range(0, len(height), 2):  # one of each label
+        h = likeliest[run]
         part, found = referee.likeliest(uncalibrated, h, run)
         exact, deviation = referee.sampled_evidence(part, found, DRAWS, rng)
         if deviation < 0.05:  # else sampling itself does not tell
             off.append(float(found.total[0]) - exact)
-    assert len(off) >= 14
+    assert len(off) >= 7
     assert np.quantile(np.abs(off), 0.8) < 0.1
     assert np.median(np.abs(off)) < 0.05
 
