@@ -18,6 +18,7 @@ from failuretwin.inference.set_up_weighing import SetUpWeighing
 ROBOT = load_robot("armpi_fpv")
 TOOL = ("tool_x_m", "tool_y_m", "tool_z_m")
 STEP_S = 0.01
+OFFERED = ("healthy", "motor_2:stuck", "motor_2:steady_state_error")
 
 
 def curve(seconds, seed=7):
@@ -71,9 +72,9 @@ def test_runs_told_seldom_are_undecided_together_too(together, tmp_path):
         parts.append(logged(folder, way, way, 1.0).assign_coords(run=[f"run {number}"]))
     runs = concatenate(parts)
     if together == "as a folder":
-        found = ft.SelfCalibratingDiagnoser(ROBOT).diagnose(runs)
+        found = ft.SelfCalibratingDiagnoser(ROBOT, hypotheses=OFFERED).diagnose(runs)
     else:
-        diagnoser = ft.BayesDiagnoser(ROBOT, "generic")
+        diagnoser = ft.BayesDiagnoser(ROBOT, "generic", hypotheses=OFFERED)
         found = diagnose_tracked(runs, diagnoser, History(begin(diagnoser, True), True)).diagnoses
     assert [one.diagnosis for one in found] == [None, None]
     for one in found:
