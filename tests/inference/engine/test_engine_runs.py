@@ -39,7 +39,7 @@ from failuretwin.inference.together.folder_posterior import folder_posterior
 from failuretwin.inference.together.habits import Habits
 
 BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
-DRAWS = 20_000
+DRAWS = 8_000
 
 
 with pytest.MonkeyPatch.context() as patch:
