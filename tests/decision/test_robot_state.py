@@ -100,7 +100,12 @@ def test_a_log_whose_set_up_is_uncertain_is_not_plainly_healthy():
     assert {row.kind for row in found.motors} == {"cannot tell"}
     assert found.step.startswith("Put the set-up right first")
     assert found.step.endswith("reverse it.")
-    assert robot_state([faulty], ROBOT).step.endswith(robot_state([faulty_run("b")], ROBOT).step)
+    repair = robot_state([faulty_run("b")], ROBOT).step
+    assert robot_state([faulty], ROBOT).step.endswith(repair)
+    perhaps = replace(faulty, quality=("the log may not fit the profile (11 %): " + doubt[-28:],))
+    assert robot_state([perhaps], ROBOT).step.startswith(
+        f"{repair} Look at the set-up too: the log"
+    )
 
 
 def test_a_fault_that_began_is_told_by_the_runs_since_then():

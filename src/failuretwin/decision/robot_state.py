@@ -48,6 +48,7 @@ from failuretwin.inference.explanation import (
 )
 from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.set_ups.set_ups import FAULT_OF_EVERY_RUN
+from failuretwin.inference.set_ups.wrong_setup import MAY_MISFIT
 from failuretwin.inference.together.fault_course import FaultCourse
 
 SUSPECT = 0.05
@@ -68,6 +69,7 @@ ZERO_STEP = (
 
 SET_UP_HEADLINE = "Healthy, but its set-up is uncertain"
 SET_UP_STEP = "Put the set-up right first, and diagnose the same log again: {doubt}."
+SET_UP_TOO = "Look at the set-up too: {doubt}."
 
 
 @dataclass(frozen=True)
@@ -223,9 +225,14 @@ def _with_zero(found: RobotState, lines: Sequence[str]) -> RobotState:
 
 
 def _with_set_up(found: RobotState, doubt: str) -> RobotState:
-    """Return a state that says first that its set-up is uncertain, and why; empty: it is not."""
+    """Return a state that says first that its set-up is uncertain, and why; empty: it is not.
+
+    A fault that is sure although the set-up may be wrong comes before it.
+    """
     if not doubt:
         return found
+    if found.state.kind == FAULTY_STATE and MAY_MISFIT in doubt:
+        return replace(found, step=f"{found.step} {SET_UP_TOO.format(doubt=doubt)}")
     if found.state.kind == HEALTHY_STATE:
         found = replace(found, state=State(OPEN_STATE), headline=SET_UP_HEADLINE)
     told = [SET_UP_STEP.format(doubt=doubt), found.step]
