@@ -51,7 +51,7 @@ def test_missing_path(refused_input):
 
 def test_folder_without_sessions(refused_input, tmp_path):
     (tmp_path / "empty").mkdir()
-    assert "no raw session" in refused_input("empty")
+    assert "no log in it or below" in refused_input("empty")
 
 
 def test_session_with_two_of_three_files(refused_input, tmp_path, write_session):

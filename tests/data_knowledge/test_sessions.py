@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from failuretwin import ReadOptions, read_runs
+from failuretwin import ReadOptions, read_runs, sample_log
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.readers.raw_sessions import (
     SESSION_FILES,
@@ -271,8 +271,17 @@ def test_source_that_does_not_exist_is_named(tmp_path, armpi, name):
 
 
 def test_folder_without_sessions_says_what_a_session_is(tmp_path, armpi):
-    with pytest.raises(InputError, match=f"no raw session.*{COMMAND}"):
+    with pytest.raises(InputError, match=f"no log in it or below.*{COMMAND}"):
         read_runs(tmp_path, armpi)
+
+
+def test_a_folder_of_tables_is_read_in_the_order_of_their_names(tmp_path, armpi):
+    (tmp_path / "may").mkdir()
+    for name in ("may/b.csv", "a.csv"):
+        shutil.copy(sample_log(), tmp_path / name)
+    runs = read_runs(tmp_path, armpi)
+    names = [f"{log}/run_{number}" for log in "ab" for number in (1, 2, 3)]
+    assert runs["run"].values.tolist() == names
 
 
 def test_no_sources_are_refused(armpi):

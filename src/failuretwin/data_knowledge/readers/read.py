@@ -45,6 +45,9 @@ from failuretwin.digital_model.robot import Robot, load_robot
 
 RunsLike: TypeAlias = "RunSet | str | Path | Sequence[str | Path]"
 """A run set, or where one is read from."""
+CSV_FILES = ("*.csv",)
+FILES = ("*.nc", "*.bag", "*.mcap", *CSV_FILES)
+"""Files that are read below a folder: those of the first kind that is there."""
 VIRTUAL_TOOL = "tool path = forward kinematics of the readings"
 """Words in the source of runs whose tool was watched by no sensor but the motors' encoders."""
 RTDE_SOURCE = "RTDE; a tool path in it is computed by the controller from its encoders"
@@ -92,7 +95,8 @@ def read_runs(
         sources: Run sets (.nc, .zarr), folders with raw sessions or published MATLAB files (they
             are searched downwards), such files (.mat), bags (.bag, .mcap, folders of ROS 2),
             LeRobot data sets (folders), RTDE recordings, or CSV files, whose columns are found
-            by their names or named by a column map.
+            by their names or named by a column map. Folders of run sets, bags or CSV files are
+            searched too.
         robot: The robot that the logs are of, or its name.
         options: How logs become runs.
         workforce: Processes that read the logs, each log once; the runs do not depend on them.
@@ -205,15 +209,16 @@ def _logs_in(path: Path, options: ReadOptions) -> list[Log]:
 
 def _logs_below(path: Path, options: ReadOptions) -> list[Log]:
     found = [Log(log, reader.read) for reader in READERS for log in reader.below(path)]
-    if not found and options.columns is not None:
-        found = [Log(file, _read_csv) for file in sorted(files_below(path, "*.csv"))]
-    if not found:
-        raise InputError(
-            f"{path}: no raw session in it or below, no published MATLAB file and no LeRobot data "
-            f"set. A session is a folder that holds {', '.join(SESSION_FILES)}. Name other files "
-            "one by one, or all CSV files with --columns."
-        )
-    return found
+    if found:
+        return found
+    for pattern in FILES if options.columns is None else CSV_FILES:
+        if files := sorted(files_below(path, pattern)):
+            return find_logs(files, options)
+    raise InputError(
+        f"{path}: no log in it or below. Expected raw sessions (folders that hold "
+        f"{', '.join(SESSION_FILES)}), published MATLAB files, LeRobot data sets, or files "
+        f"{', '.join(FILES)}."
+    )
 
 
 def _read_run_set(path: Path, robot: Robot, options: ReadOptions) -> list[RunSet]:
