@@ -16,7 +16,6 @@ Section: docs/inference.md#calibration-and-geometry
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -377,21 +376,7 @@ def _triple(values: FloatArray) -> Triple:
 def _across(moved: FloatArray) -> FloatArray:
     """Return the transform (4, 4) that moves an axis across itself by shift and tilt, (4,)."""
     T = np.eye(4)
-    if not moved.any():
-        return T
-    x, y, tilt_x, tilt_y = moved.tolist()
-    c, sine, one_less = _turn_by(math.hypot(tilt_x, tilt_y))
-    T[:3, :3] = [
-        [c + one_less * tilt_x**2, one_less * tilt_x * tilt_y, sine * tilt_y],
-        [one_less * tilt_x * tilt_y, c + one_less * tilt_y**2, -sine * tilt_x],
-        [-sine * tilt_y, sine * tilt_x, c],
-    ]
-    T[:2, 3] = x, y
+    if moved.any():
+        T[:3, :3] = Rotation.from_rotvec([moved[2], moved[3], 0.0]).as_matrix()
+        T[:2, 3] = moved[:2]
     return T
-
-
-def _turn_by(angle: float) -> tuple[float, float, float]:
-    """Return cos a, sin a / a and (1 - cos a) / a^2, also where the angle a [rad] is 0."""
-    half = math.sin(0.5 * angle) / (0.5 * angle) if angle > 0.0 else 1.0
-    sine = math.sin(angle) / angle if angle > 0.0 else 1.0
-    return math.cos(angle), sine, 0.5 * half**2
