@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 
 import pytest
 
 from failuretwin.app.console.users import add_user
-from fleet_servers import free_port
+from fleet_servers import free_port, listens
 from waiting import wait_for
 
 REQUIRE = "FAILURETWIN_REQUIRE_CHROMIUM"
@@ -67,8 +66,7 @@ class ConsoleServer:
 
     def _listens(self):
         assert self.process.poll() is None, "the server ended"
-        with socket.socket() as one:
-            return one.connect_ex(("127.0.0.1", self.port)) == 0
+        return listens(self.port)
 
     def kill(self):
         self.process.kill()

@@ -34,12 +34,21 @@ def free_port():
         return one.getsockname()[1]
 
 
+def listens(port):
+    """Return whether a server listens at a port of this computer.
+
+    A connection to a port that nobody has may come from that port: then it is one with itself.
+    """
+    with socket.socket() as one:
+        reached = one.connect_ex(("127.0.0.1", port)) == 0
+        return reached and one.getsockname() != one.getpeername()
+
+
 def wait_for(port, process):
     for _ in range(200):
         assert process.poll() is None, "the server ended"
-        with socket.socket() as one:
-            if one.connect_ex(("127.0.0.1", port)) == 0:
-                return
+        if listens(port):
+            return
         time.sleep(0.05)
     raise AssertionError(f"nothing listens on port {port}")
 
