@@ -256,7 +256,8 @@ def simulated(
     drive = Drive(wanted[None], held, compliance=arm.compliance[None])
     position = ServoEngine(robot).angles(drive, time)[0]
     measured, read = _sensed(robot, position, time, rate, late, rng)
-    ends = strokes[(strokes > 0.0) & (strokes <= time[-1])]  # an error is that where a stroke ends
+    # The error of a ramp is that at its end; on curves it is what there is on the way.
+    ends = strokes[(strokes > 0.0) & (strokes <= time[-1])] if motion is blended else np.zeros(0)
     whose, when = max(case.motor, 0), ends if len(ends) else time[time >= np.nan_to_num(onset)]
     there = np.interp(when, time, error[:, whose])
     name = "healthy" if case.motor < 0 else f"{robot.motor_names[case.motor]}:{case.fault}"
