@@ -1,10 +1,13 @@
-"""A short log as plain numbers, to be sent through any link."""
+"""Short logs: as plain numbers, to be sent through any link, and as a run without any error."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+
+from failuretwin.core.runs import RunTable
+from failuretwin.digital_model.twin import DigitalTwin
 
 
 @dataclass(frozen=True)
@@ -33,3 +36,22 @@ def make_log():
         reading_time=1677764088.0 + np.arange(60) * 0.1,
         counts=rng.integers(300, 700, (60, 4)).astype(float),
     )
+
+
+def exact_run(robot, command, followed, step_s=0.01):
+    """One run of an arm that does exactly what `followed` says, its tool read at 10 Hz.
+
+    The command and what is followed are (time, motor) [rad].
+    """
+    measured = np.full((len(command), 3), np.nan)
+    measured[::10] = DigitalTwin(robot).path(followed[::10])
+    table = RunTable(
+        run=["run"],
+        motor=robot.motor_names,
+        time=step_s * np.arange(len(command)),
+        command=command[None],
+        measured=measured[None],
+        measured_rate_hz=10.0,
+        attributes={"robot": robot.name, "source": "simulated"},
+    )
+    return table.to_dataset()

@@ -10,7 +10,7 @@ import failuretwin as ft
 from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Stretches
-from failuretwin.core.runs import RunTable, concatenate, truth_of
+from failuretwin.core.runs import concatenate, truth_of
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -34,6 +34,7 @@ from failuretwin.inference.observation.on_the_way import (
     likeliest_lag,
     on_the_way,
 )
+from little_logs import exact_run
 
 ROBOT = load_robot("armpi_fpv")
 STEP_S = 0.01
@@ -41,22 +42,11 @@ WITHOUT_REST = RandomMovements(count=6, period_s=1.2, ramp_shares=(1.0,))
 LONG = replace(WITHOUT_REST, count=8)
 
 
-def exact_run(command, late_s):
+def late_run(command, late_s):
     """One run of an arm that follows its command (time, motor) exactly, so much later."""
     time = STEP_S * np.arange(len(command))
     seen = np.stack([np.interp(time - late_s, time, one) for one in command.T], axis=-1)
-    measured = np.full((len(time), 3), np.nan)
-    measured[::10] = DigitalTwin(ROBOT).path(seen[::10])
-    table = RunTable(
-        run=["run"],
-        motor=ROBOT.motor_names,
-        time=time,
-        command=command[None],
-        measured=measured[None],
-        measured_rate_hz=10.0,
-        attributes={"robot": ROBOT.name, "source": "simulated"},
-    )
-    return table.to_dataset()
+    return exact_run(ROBOT, command, seen)
 
 
 def zigzag(seconds=6.0):
@@ -89,7 +79,7 @@ def moments(runs):
 
 def test_stretches_of_ramps_are_those_of_the_command():
     command, healthy = zigzag(), model()
-    _, seen = moments(exact_run(command, 0.0))
+    _, seen = moments(late_run(command, 0.0))
     stretches = seen.movements
     assert isinstance(stretches, Stretches)
     assert seen.usable.all()
@@ -110,7 +100,7 @@ def test_stretches_of_ramps_are_those_of_the_command():
 def test_a_curve_is_read_on_its_way_also_where_the_tool_rests_behind_it():
     """Its last stretch, up to the rest, begins where the one before was read."""
     command = np.concatenate([curve(), np.repeat(curve()[-1:], 200, axis=0)])
-    _, seen = moments(exact_run(command, 0.0))
+    _, seen = moments(late_run(command, 0.0))
     stretches, time = seen.movements, STEP_S * np.arange(len(command))
     assert isinstance(stretches, Stretches)
     assert stretches.at_rest[0].tolist() == [False] * (len(stretches.at_rest[0]) - 1) + [True]
@@ -125,7 +115,7 @@ def test_a_motor_that_stops_on_a_curve_is_found_where_the_tool_rests_behind_it()
     command = np.concatenate([curve(), np.repeat(curve()[-1:], 200, axis=0)])
     stuck = command.copy()
     stuck[350:, 1] = stuck[350, 1]
-    runs = exact_run(command, 0.0)
+    runs = late_run(command, 0.0)
     seen = np.full((len(command), 3), np.nan)
     seen[::10] = DigitalTwin(ROBOT).path(stuck[::10])
     (found,) = ft.diagnose(
@@ -140,7 +130,7 @@ def test_a_motor_that_stops_on_a_curve_is_found_where_the_tool_rests_behind_it()
 def test_a_motor_that_stops_on_a_curve_did_so_where_it_was_told_to_pass(motor, at):
     """The straight line between two moments is off that by up to half a second."""
     command = curve()
-    stuck, runs = command.copy(), exact_run(command, 0.0)
+    stuck, runs = command.copy(), late_run(command, 0.0)
     stuck[at:, motor] = stuck[at, motor]
     seen = np.full((len(command), 3), np.nan)
     seen[::10] = DigitalTwin(ROBOT).path(stuck[::10])
@@ -156,7 +146,7 @@ def test_a_motor_that_stops_on_a_curve_did_so_where_it_was_told_to_pass(motor, a
 def test_an_error_that_comes_on_a_curve_and_stays_is_sized_and_dated(motor, error, at):
     """Taken for another zero of its motor, it would seem there from the start, at half its size."""
     command = curve()
-    off, runs = command.copy(), exact_run(command, 0.0)
+    off, runs = command.copy(), late_run(command, 0.0)
     off[at:, motor] += error
     seen = np.full((len(command), 3), np.nan)
     seen[::10] = DigitalTwin(ROBOT).path(off[::10])
@@ -174,7 +164,7 @@ def test_an_error_that_comes_on_a_curve_and_stays_is_sized_and_dated(motor, erro
 def test_a_tool_that_still_arrives_behind_the_last_command_is_not_at_rest(late_s):
     """Clocks are apart: to take it for a rest would blame a motor of having stopped before."""
     command = np.concatenate([curve(), np.repeat(curve()[-1:], round(late_s / STEP_S), axis=0)])
-    runs = exact_run(command, late_s)
+    runs = late_run(command, late_s)
     healthy = model()
     evidence = Evidence(runs, healthy.settings, healthy.sensors).sound
     known = on_the_way(evidence, healthy, likeliest_lag(evidence, healthy))
@@ -188,7 +178,7 @@ def test_a_motor_that_follows_later_is_found_and_timed():
     command, time = curve(), STEP_S * np.arange(len(curve()))
     late = command.copy()
     late[:, 1] = np.interp(np.where(time < 3.5, time, time - 0.2), time, command[:, 1])
-    runs, seen = exact_run(command, 0.0), np.full((len(command), 3), np.nan)
+    runs, seen = late_run(command, 0.0), np.full((len(command), 3), np.nan)
     seen[::10] = DigitalTwin(ROBOT).path(late[::10])
     modes = ("stuck", "steady_state_error", "lag")
     hypotheses = ["healthy", *(f"motor_{k}:{mode}" for k in (1, 2, 3) for mode in modes)]
@@ -207,7 +197,7 @@ def test_encoders_are_read_on_the_way(sensing):
     command, time = curve(), STEP_S * np.arange(len(curve()))
     stuck = command.copy()
     stuck[350:, 1] = stuck[350, 1]
-    runs, seen = exact_run(command, 0.0), np.full(command.shape, np.nan)
+    runs, seen = late_run(command, 0.0), np.full(command.shape, np.nan)
     seen[::10] = stuck[::10]
     tool = np.where(np.isfinite(seen[:, :1]), DigitalTwin(ROBOT).path(stuck), np.nan)
     runs = runs.assign(
@@ -232,7 +222,7 @@ def test_encoders_are_read_on_the_way(sensing):
 def test_a_motor_that_hardly_moves_is_named():
     command = curve()
     command[:, 2] = 0.3
-    (found,) = ft.diagnose(exact_run(command, 0.0), ROBOT, "generic")
+    (found,) = ft.diagnose(late_run(command, 0.0), ROBOT, "generic")
     told = [line for line in found.explanation if " moved " in line]
     assert told == ["motor 3 moved 0 deg: if it is stuck, this hardly shows"]
 
@@ -240,7 +230,7 @@ def test_a_motor_that_hardly_moves_is_named():
 def test_points_of_an_arm_without_lag_are_those_of_the_command():
     healthy = model()
     for command in (zigzag(), curve()):
-        _, seen = moments(exact_run(command, healthy.lag_s))
+        _, seen = moments(late_run(command, healthy.lag_s))
         expected = healthy.sensors.expected(seen.movements.target[0])[0]
         rounded = 0.0015  # readings lie at the nearest time of the grid
         assert np.abs(seen.point[0] - expected)[seen.usable[0]].max() < rounded
@@ -255,7 +245,7 @@ def once_a_second(command):
 
 def test_a_curve_that_is_told_once_a_second_cannot_be_judged_on_its_way():
     healthy = model()
-    followed = exact_run(curve(), healthy.lag_s)
+    followed = late_run(curve(), healthy.lag_s)
     _, seen = moments(followed)
     assert seen.usable.any()
     told = once_a_second(curve())[None]
@@ -268,13 +258,13 @@ def test_a_faulty_motor_on_straight_ramps_is_judged_on_its_way(fault):
     healthy, command = model(), zigzag()
     moved = command.copy()
     moved[:, 1] = command[150, 1] if fault == "stuck" else command[:, 1] + 0.1
-    run = exact_run(moved, healthy.lag_s)
+    run = late_run(moved, healthy.lag_s)
     _, seen = moments(run.assign(command=(run["command"].dims, command[None])))
     assert seen.usable.all()
 
 
 def test_a_curve_has_a_moment_every_second_and_loses_no_command():
-    healthy, seen = moments(exact_run(curve(), 0.0))
+    healthy, seen = moments(late_run(curve(), 0.0))
     assert seen.usable.sum() == 8
     assert not seen.movements.whole.any()
     found = moments_of(healthy.without_doubt, seen)
@@ -285,7 +275,7 @@ def test_a_curve_has_a_moment_every_second_and_loses_no_command():
 
 
 def test_a_ramp_may_be_lost_or_not_have_begun():
-    healthy, seen = moments(exact_run(zigzag(), 0.0))
+    healthy, seen = moments(late_run(zigzag(), 0.0))
     found = moments_of(healthy.without_doubt, seen)
     waits = found.lost[0, 1].all(axis=-1) & np.isfinite(found.log_weight[0, 1])
     assert waits.sum() == 1
@@ -296,7 +286,7 @@ def test_a_ramp_may_be_lost_or_not_have_begun():
 
 @pytest.mark.parametrize("more_s", [-0.04, 0.0, 0.04])
 def test_the_lag_is_found_and_is_no_fault(more_s):
-    runs = exact_run(curve(), model().lag_s + more_s)
+    runs = late_run(curve(), model().lag_s + more_s)
     healthy, seen = moments(runs)
     weighing = robot_weighing(
         RunLikelihood(seen, healthy), paper_hypotheses(ROBOT.motor_names), ft.Priors()
@@ -320,7 +310,7 @@ def followed(command, constant_s):
 def test_the_bend_of_a_first_order_lag_is_found():
     """x = q(t - T) + T^2 qdd / 2: all of a bend whose time constant is 0.05 s, not half of it."""
     command = curve()
-    runs = exact_run(followed(command, 0.05), 0.0).assign(
+    runs = late_run(followed(command, 0.05), 0.0).assign(
         command=(("run", "time", "motor"), command[None])
     )
     healthy = model()
@@ -349,7 +339,7 @@ def clipped():
 def test_a_bend_is_what_a_first_order_lag_makes_of_the_command(command):
     """Against its response step by step, also just behind a corner."""
     healthy = model()
-    _, seen = moments(exact_run(command, 0.0))
+    _, seen = moments(late_run(command, 0.0))
     fine = 1e-3
     time = np.arange(0.0, STEP_S * (len(command) - 1), fine)
     told = np.stack([np.interp(time, STEP_S * np.arange(len(command)), c) for c in command.T])
@@ -368,7 +358,7 @@ def test_a_bend_is_what_a_first_order_lag_makes_of_the_command(command):
 
 def test_a_robot_that_trails_is_expanded_about_its_lags():
     """Poses that follow the kinematics exactly, of which columns of theta are the first order."""
-    healthy, seen = moments(exact_run(curve(), 0.0))
+    healthy, seen = moments(late_run(curve(), 0.0))
     found, lag_s = moments_of(healthy, seen), np.array([0.0, 0.01, 0.02, 0.03])
     poses = [one.base[:, :, 0] for one in (found, found.trailing(lag_s))]
     np.testing.assert_allclose(poses[0] - poses[1], found.speed[:, :, 0] * lag_s, atol=1e-12)
@@ -391,7 +381,7 @@ def test_clocks_that_are_apart_are_found(late_s):
     late = healthy.lag_s + late_s
     command = curve()
     if late < 0.0:  # a clock that is ahead: the command is told later
-        runs = exact_run(command, 0.0)
+        runs = late_run(command, 0.0)
         told = np.stack(
             [
                 np.interp(
@@ -403,7 +393,7 @@ def test_clocks_that_are_apart_are_found(late_s):
         )
         runs = runs.assign(command=(("run", "time", "motor"), told[None]))
     else:
-        runs = exact_run(command, late)
+        runs = late_run(command, late)
     evidence = Evidence(runs, healthy.settings, healthy.sensors).sound
     found = likeliest_lag(evidence, healthy) - healthy.lag_s
     assert found == pytest.approx(late_s, abs=0.016)
@@ -412,7 +402,7 @@ def test_clocks_that_are_apart_are_found(late_s):
 def test_friction_turns_over_within_twice_itself():
     """Not with the travel since the moment before: a curve turns between."""
     command = curve()
-    healthy, seen = moments(exact_run(command, 0.0))
+    healthy, seen = moments(late_run(command, 0.0))
     found = moments_of(healthy.without_doubt, seen)
     friction, time = np.array(healthy.settling.friction), STEP_S * np.arange(len(command))
     for m, at in enumerate(found.time[0] - healthy.lag_s):

@@ -7,15 +7,14 @@ import pytest
 
 import failuretwin as ft
 from failuretwin.core.movements import find_movements
-from failuretwin.core.runs import RunTable
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import load_robot
-from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.engine.moments import moments_of
 from failuretwin.inference.engine.transient_rows import Ramps
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.on_the_way import on_the_way
+from little_logs import exact_run
 
 ROBOT = load_robot("armpi_fpv")
 STEP_S = 0.01
@@ -39,29 +38,13 @@ def slowed(time, command, motor, factor, onset):
     return replace(movements, ramp_duration=ramp).reference(time)[0]
 
 
-def run_of(time, command, followed):
-    """One run of an arm that does exactly what `followed` says, its tool read at 10 Hz."""
-    measured = np.full((len(time), 3), np.nan)
-    measured[::10] = DigitalTwin(ROBOT).path(followed[::10])
-    table = RunTable(
-        run=["run"],
-        motor=ROBOT.motor_names,
-        time=time,
-        command=command[None],
-        measured=measured[None],
-        measured_rate_hz=10.0,
-        attributes={"robot": ROBOT.name, "source": "simulated"},
-    )
-    return table.to_dataset()
-
-
 @pytest.mark.parametrize("ramp_s", [1.2, 3.4])
 @pytest.mark.parametrize(("factor", "first"), [(1.5, 0), (2.0, 2), (4.0, 1)])
 def test_a_slow_motor_is_where_the_twin_moves_it(ramp_s, factor, first):
     """Also where a long ramp is read several times, and where it was cut off before."""
     time, command = zigzag(ramp_s)
     healthy = HealthyModel.of(load_calibration("generic", ROBOT))
-    evidence = Evidence(run_of(time, command, command), healthy.settings, healthy.sensors).sound
+    evidence = Evidence(exact_run(ROBOT, command, command), healthy.settings, healthy.sensors).sound
     moments = moments_of(healthy, on_the_way(evidence, healthy, healthy.lag_s))
     truth = slowed(time, command, 1, factor, first * ramp_s - 0.1)
     first = int(np.searchsorted(moments.time[0], first * ramp_s + healthy.lag_s))
@@ -76,7 +59,7 @@ def test_a_slow_motor_is_where_the_twin_moves_it(ramp_s, factor, first):
 @pytest.mark.parametrize(("motor", "factor", "onset"), [(1, 2.0, 3.0), (0, 3.0, -1.0)])
 def test_a_slow_motor_is_found_and_sized(motor, factor, onset):
     time, command = zigzag()
-    runs = run_of(time, command, slowed(time, command, motor, factor, onset))
+    runs = exact_run(ROBOT, command, slowed(time, command, motor, factor, onset))
     (found,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=HYPOTHESES)
     assert str(found.diagnosis) == f"motor_{motor + 1}:slow"
     assert found.magnitude == pytest.approx(1.0 - 1.0 / factor, abs=0.05)
@@ -87,14 +70,14 @@ def test_a_late_motor_is_not_taken_for_a_slow_one():
     time, command = zigzag()
     late = command.copy()
     late[:, 1] = np.interp(np.where(time < 3.5, time, time - 0.2), time, command[:, 1])
-    (found,) = ft.diagnose(run_of(time, command, late), ROBOT, "generic", hypotheses=HYPOTHESES)
+    (found,) = ft.diagnose(exact_run(ROBOT, command, late), ROBOT, "generic", hypotheses=HYPOTHESES)
     assert str(found.diagnosis) == "motor_2:lag"
     assert found.magnitude == pytest.approx(0.2, abs=0.03)
 
 
 def test_a_healthy_arm_is_neither():
-    time, command = zigzag()
-    runs = run_of(time, command, command)
+    _, command = zigzag()
+    runs = exact_run(ROBOT, command, command)
     (found,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=HYPOTHESES)
     transient = sum(p for h, p in found.posterior.items() if str(h).endswith(("lag", "slow")))
     assert str(found.diagnosis) == "healthy"
