@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.foreign import check_memory
@@ -338,21 +338,15 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     count = sum(part.sizes["run"] for part in parts)
     size = padded_bytes(count, length, first.sizes["motor"])
     check_memory(size, "the runs", f"{count} runs, padded to {length} samples,")
-    movements = max((part.sizes.get("movement", 0) for part in parts), default=0)
-    padded = [_pad(part[shared], longest["time"].values, movements) for part in parts]
-    whole = xr.concat(
-        padded,
-        "run",
-        data_vars="minimal",
-        coords="minimal",
-        join="exact",
-        compat="override",
-        combine_attrs="override",
+    sizes = {"time": length, "movement": max(p.sizes.get("movement", 0) for p in parts)}
+    whole = xr.Dataset(
+        {name: _stacked([part[name] for part in parts], sizes) for name in shared},
+        {name: longest[name] for name in first.coords if name in first.dims and name != "run"},
+        first.attrs,
     )
     whole.attrs["measured_rate_hz"] = min(measured_rate(part) for part in parts)
-    return whole.assign_coords(
-        run=np.asarray(unique_names([str(name) for name in whole["run"].values]), dtype=object)
-    )
+    names = [str(name) for part in parts for name in part["run"].values]
+    return whole.assign_coords(run=np.asarray(unique_names(names), dtype=object))
 
 
 def padded_bytes(runs: int, samples: int, motors: int) -> float:
@@ -372,15 +366,28 @@ def _check_same_kind(first: xr.Dataset, other: xr.Dataset) -> None:
         )
 
 
-def _pad(part: xr.Dataset, time: FloatArray, movements: int) -> xr.Dataset:
-    """Return `part` on the longer grid `time`: command held, everything else NaN."""
-    if part.sizes["time"] < len(time):
-        held = part["command"].pad(time=(0, len(time) - part.sizes["time"]), mode="edge")
-        part = part.drop_vars("command").pad(time=(0, len(time) - part.sizes["time"]))
-        part = part.assign(command=held.drop_vars("time", errors="ignore"))
-    if 0 < part.sizes.get("movement", 0) < movements:
-        part = part.pad(movement=(0, movements - part.sizes["movement"]))
-    return part.assign_coords(time=time)
+def _stacked(parts: Sequence[xr.DataArray], sizes: Mapping[str, int]) -> xr.Variable:
+    """Return one variable of all runs, padded: command held, everything else NaN."""
+    import xarray as xr
+
+    first = parts[0]
+    if "run" not in first.dims:
+        return first.variable
+    values = [part.values for part in parts]
+    for axis, dim in enumerate(first.dims):
+        if dim in sizes:
+            values = [_padded(v, axis, sizes[str(dim)], first.name == "command") for v in values]
+    return xr.Variable(first.dims, np.concatenate(values, first.dims.index("run")), first.attrs)
+
+
+def _padded(values: NDArray[Any], axis: int, size: int, held: bool) -> NDArray[Any]:
+    """Return values that are as long as `size` on one axis; the last is held, or NaN follows."""
+    missing = size - values.shape[axis]
+    if missing == 0:
+        return values
+    shape = [missing if k == axis else n for k, n in enumerate(values.shape)]
+    more = np.broadcast_to(values.take([-1], axis) if held else np.nan, shape)
+    return np.concatenate([values, more], axis)
 
 
 def unique_names(names: Sequence[str]) -> list[str]:
