@@ -149,28 +149,38 @@ class Weighing:
         return RunLikelihood(seen, model.without_doubt, way)
 
     @cached_property
+    def summed(self) -> IntArray:
+        """Runs that node sums weigh too: all, or those on whose way readings count."""
+        way, runs = self.likelihood.moving, np.arange(len(self.likelihood.usable))
+        if len(self.with_rows) < len(self.hypotheses):
+            return runs
+        return runs[:0] if way is None else np.flatnonzero(way.seen.any(axis=(1, 2)))
+
+    @cached_property
     def _settled_at_best(self) -> list[MarginalLikelihood]:
-        """Settled positions at the most probable theta, by hypothesis."""
-        alone = replace(self.at_best, moving=None)
+        """Settled positions of these runs at the most probable theta, by hypothesis."""
+        alone = replace(self.at_best, moving=None)[self.summed]
         return marginal_likelihoods(alone, self.hypotheses, self.priors)
 
     @cached_property
     def _whole_at_best(self) -> list[MarginalLikelihood]:
-        """All readings at the most probable theta, by hypothesis."""
+        """All readings of these runs at the most probable theta, by hypothesis."""
         if self.likelihood.moving is None:
             return self._settled_at_best
-        return marginal_likelihoods(self.at_best, self.hypotheses, self.priors)
+        return marginal_likelihoods(self.at_best[self.summed], self.hypotheses, self.priors)
 
     @cached_property
     def log_evidence(self) -> FloatArray:
         """Log of weight times evidence, (run, component, hypothesis)."""
-        if self.likelihood.moving is None:
+        if self.likelihood.moving is None or not len(self.summed):
             return self._log_settled
         settled, whole = (
             np.stack([one.log_evidence for one in says], axis=1)
             for says in (self._settled_at_best, self._whole_at_best)
         )
-        return np.asarray(self._log_settled + (whole - settled)[:, None])
+        found = self._log_settled.copy()
+        found[self.summed] += (whole - settled)[:, None]
+        return found
 
     @cached_property
     def _log_settled(self) -> FloatArray:
@@ -221,19 +231,21 @@ class Weighing:
 
     def _with_way(self, h: int, settled: MarginalLikelihood | None) -> MarginalLikelihood:
         """Return what runs say of a hypothesis, those on whose way it counts by all readings."""
-        way = self.likelihood.moving
-        if way is None and settled is not None:
+        way, summed = self.likelihood.moving, self.summed
+        if settled is None:
+            return self._whole_at_best[h]
+        if way is None or not len(summed):
             return settled
         whole = self._whole_at_best[h]
-        if way is None or settled is None:
-            return whole
-        counts: BoolArray = np.any(way.seen, axis=(1, 2))
-        said = [whole if own else settled for own in counts.tolist()]
+        said = [(settled, run) for run in range(len(way.seen))]
+        for at, run in enumerate(summed.tolist()):
+            if way.seen[run].any():
+                said[run] = whole, at
         return MarginalLikelihood(
-            whole.log_evidence,
-            lambda run: said[run].by_movement(run),
-            lambda run: said[run].settled(run),
-            lambda run: said[run].estimate(run),
+            settled.log_evidence,
+            lambda run: said[run][0].by_movement(said[run][1]),
+            lambda run: said[run][0].settled(said[run][1]),
+            lambda run: said[run][0].estimate(said[run][1]),
         )
 
     def posterior(self) -> Posterior:
