@@ -12,8 +12,9 @@ a second or so. A motor gets stuck at any time, or is off by two to four times w
 it: by another error after each stroke, or, on curves, by one that comes in mid-run. With
 `--calibrated N` all are of one robot, calibrated from N healthy runs of the same motion. With
 `--rest` an arm stands still for the last seconds of its runs. With `--also lag` motors also come to
-follow 0.2 s late in mid-run, with `--also slow` they lose half of their speed from the next stroke
-on: it takes twice as long, the next one begins where it was cut off. With
+follow 0.2 s late in mid-run, with `--also slow` they lose half of their speed: ramps take twice as
+long and begin where the last was cut off, on curves the motor keeps below half of its largest
+speed. With `--also backlash` joints come to have play. With
 `--told` the diagnosis is told the shares of healthy and faulty runs and the sizes of errors as
 drawn: only then can the calibration error be that of chance.
 """
@@ -157,6 +158,8 @@ LATE, DEAD_S = "lag", 0.2
 """The mode of motors that come to follow late, and by how much [s]."""
 SLOW, SPEED = "slow", 0.5
 """The mode of motors that lose speed, and what is left of it."""
+PLAY, PLAY_RAD = "backlash", (0.06, 0.14)
+"""The mode of joints with play, and the range of the play [rad]."""
 
 
 def cases(
@@ -239,13 +242,19 @@ def simulated(
     speed = np.gradient(command, STEP_S, axis=0)
     friction = np.asarray(settling.friction) * _direction(speed)
     followed = command.copy()
-    if case.fault in (LATE, SLOW):
+    if case.fault in (LATE, SLOW, PLAY):
         onset = rng.uniform(*ONSET_OF_CURVES) * duration_s
-    if case.fault == SLOW:
-        followed[:, case.motor] = _slowed(time, command[:, case.motor], strokes, onset)
+    told = command[:, max(case.motor, 0)]
+    if case.fault == SLOW and motion is blended:
+        followed[:, case.motor] = _slowed(time, told, strokes, onset)
+    elif case.fault == SLOW:
+        followed[:, case.motor] = _limited(time, told, onset)
+    if case.fault == PLAY:
+        play = rng.uniform(*PLAY_RAD)
+        followed[:, case.motor] = _with_play(np.where(time < onset, 0.0, play), told)
     if case.fault == LATE:
         late_by = np.where(time < onset, 0.0, DEAD_S)
-        followed[:, case.motor] = np.interp(time - late_by, time, command[:, case.motor])
+        followed[:, case.motor] = np.interp(time - late_by, time, told)
     wanted = followed + np.asarray(settling.bias) - friction + scatter + error
     wanted = np.stack([np.interp(time - arm.delay_s, time, one) for one in wanted.T], axis=-1)
     wanted = first_order_lag(wanted.T, wanted[0], STEP_S, arm.lag_s).T
@@ -309,6 +318,23 @@ def _slowed(time: FloatArray, command: FloatArray, strokes: FloatArray, onset: f
         share = (told - low) / (high - low) if high != low else np.zeros(inside.sum())
         found[inside] = here + (high - here) * share
         here = found[inside][-1]
+    return found
+
+
+def _limited(time: FloatArray, command: FloatArray, onset: float) -> FloatArray:
+    """Return where a motor gets that keeps below a share of its largest speed from an onset on."""
+    step = SPEED * np.abs(np.diff(command)).max()
+    found, first = command.copy(), int(np.searchsorted(time, onset))
+    for k in range(max(first, 1), len(found)):
+        found[k] = found[k - 1] + np.clip(command[k] - found[k - 1], -step, step)
+    return found
+
+
+def _with_play(play: FloatArray, command: FloatArray) -> FloatArray:
+    """Return where a joint with play stands whose motor follows a command, (time,) [rad]."""
+    found = command.copy()
+    for k in range(1, len(found)):
+        found[k] = np.clip(found[k - 1], command[k] - 0.5 * play[k], command[k] + 0.5 * play[k])
     return found
 
 
@@ -466,7 +492,7 @@ def line(found: list[Diagnosis], seconds: float) -> str:
     healthy = [d for d in found if d.truth == "healthy"]
     false = sum(d.diagnosis != "healthy" for d in healthy)
     parts = [f"healthy blamed {false} of {len(healthy)}"]
-    for mode in (*MODES, LATE, SLOW):
+    for mode in (*MODES, LATE, SLOW, PLAY):
         some = [d for d in found if str(d.truth).endswith(mode)]
         if some or mode in MODES:
             parts.append(f"{mode} {int(right(some).sum())} of {len(some)}")
@@ -512,7 +538,9 @@ def main() -> None:
     parser.add_argument("--told", action="store_true", help="shares and sizes as drawn")
     parser.add_argument("--rest", type=float, default=0.0, help="last seconds that stand still")
     parser.add_argument("--sensing", default="tool", help="what is believed")
-    parser.add_argument("--also", nargs="+", default=[], choices=[LATE, SLOW], help="more faults")
+    parser.add_argument(
+        "--also", nargs="+", default=[], choices=[LATE, SLOW, PLAY], help="more faults"
+    )
     parser.add_argument("--logs")
     parser.add_argument("--share", type=float)
     given = parser.parse_args()

@@ -118,9 +118,9 @@ class Movements(ArrayStruct):
         return times, values
 
 
-AGES_S = np.array([0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 1.0])
-"""How long before a reading it is kept what motors were told: a motor with a dead time follows
-that."""
+WAY_SAMPLES = 32
+"""Samples of the reference from one reading to the next: what a motor makes of its way depends on
+all of it."""
 
 
 @dataclass(frozen=True)
@@ -139,8 +139,8 @@ class Stretches(Movements):
         whole: Whether a stretch is all that is seen of its movement, (run, movement).
         curved: Whether its movement is a curve, not straight ramps, (run, movement).
         movement: Index of its movement, (run, movement).
-        before: Reference `AGES_S` before the reading, (run, movement, motor, age) [rad]; NaN at
-            rest.
+        way: Reference that shows from the reading before up to this one, evenly in time, (run,
+            movement, motor, sample) [rad]; NaN where no run is on its way.
     """
 
     beginning: Annotated[FloatArray, Axes("run", "movement", "motor", empty=np.nan)]
@@ -152,7 +152,7 @@ class Stretches(Movements):
     whole: Annotated[BoolArray, Axes("run", "movement", empty=True)]
     curved: Annotated[BoolArray, Axes("run", "movement", empty=False)]
     movement: Annotated[IntArray, Axes("run", "movement", empty=0)]
-    before: Annotated[FloatArray, Axes("run", "movement", "motor", "age", empty=np.nan)]
+    way: Annotated[FloatArray, Axes("run", "movement", "motor", "sample", empty=np.nan)]
 
     @classmethod
     def of(cls, movements: Movements) -> Stretches:
@@ -160,7 +160,7 @@ class Stretches(Movements):
         if isinstance(movements, Stretches):
             return movements
         runs, count, motors = movements.target.shape
-        found = cls.empty(run=runs, movement=count, motor=motors, age=len(AGES_S))
+        found = cls.empty(run=runs, movement=count, motor=motors, sample=WAY_SAMPLES)
         found.movement[:] = np.arange(count)
         found.beginning[:] = movements.origin()
         known = ("initial", "target", "ramp_duration", "start")

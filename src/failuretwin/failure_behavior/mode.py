@@ -124,6 +124,8 @@ class FaultMode(ABC):
     """Reaction to it; None: the default of its signature."""
     needs_compliance: ClassVar[bool] = False
     """Whether it is only visible at a motor that yields under load."""
+    hysteresis: ClassVar[bool] = False
+    """Whether the way to a target counts, not only the target and the last travel."""
 
     onset_s: Range = (0.0, 5.0)
     profiles: tuple[str, ...] = (STEP,)
@@ -213,6 +215,16 @@ class FaultMode(ABC):
             time: Uniform grid, (time,) [s].
         """
         return reference
+
+    def on_curve(self, faults: FaultGroup, reference: FloatArray, time: FloatArray) -> FloatArray:
+        """Return the reference of the servo loop where it is streamed, not a ramp for each order.
+
+        Args:
+            faults: The faults of these runs.
+            reference: What is streamed, (run, time) [rad].
+            time: Uniform grid, (time,) [s].
+        """
+        return self.on_reference(faults, reference, time)
 
     def held(self, faults: FaultGroup, time: FloatArray) -> BoolArray | None:
         """Return when the gear holds the motor, (run, time) at `time` (time,) [s]; None: never."""

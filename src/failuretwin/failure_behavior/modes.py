@@ -125,7 +125,10 @@ CHANCE, LOST = "chance", "lost"
 
 @dataclass(frozen=True, kw_only=True)
 class Slow(SizedMode):
-    """The motor loses a share of its speed; late movements are interrupted by the next."""
+    """The motor loses a share of its speed; late movements are interrupted by the next.
+
+    Along a streamed curve it keeps below what is left of the largest speed that it is told.
+    """
 
     mode: ClassVar[str] = "slow"
     unit = "ratio"
@@ -144,6 +147,17 @@ class Slow(SizedMode):
         """Lengthen the ramps of movements that start after the onset."""
         speed = 1.0 - faults.effect(orders.start)
         return replace(orders, ramp_duration=orders.ramp_duration / speed)
+
+    def on_curve(self, faults: FaultGroup, reference: FloatArray, time: FloatArray) -> FloatArray:
+        """Limit the speed."""
+        told = np.abs(np.diff(reference, axis=1))
+        most = (told.max(axis=1, initial=0.0)[:, None] * (1.0 - faults.effect(time))).T
+        wanted = reference.T
+        output = wanted.copy()
+        for k in range(1, len(time)):
+            here = output[k - 1]
+            output[k] = np.clip(wanted[k], here - most[k], here + most[k])
+        return output.T
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,6 +212,7 @@ class Backlash(SizedMode):
     mechanisms = ("worn gear teeth", "loose horn screw")
     advice = "Tighten the horn screw; replace the gear set if the play stays."
     allowed_profiles: ClassVar[tuple[str, ...]] = (STEP, RAMP)
+    hysteresis: ClassVar[bool] = True
 
     magnitude: Range = (0.03, 0.12)
     profiles: tuple[str, ...] = (STEP, RAMP)

@@ -13,7 +13,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtri
 
-from failuretwin.core.movements import AGES_S
 from failuretwin.core.numerics import log_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.inference.engine.moved_motor import FREE_RAD, Angle, MovedMotor
@@ -166,6 +165,7 @@ def _stuck_onsets(
     begin, length = np.nan_to_num(intervals.begin), intervals.length
     lag, scatter = np.hypot(*model.lag_deviations_s), float(model.scatter[motor])
     share, curved = np.full(len(POINTS), 1.0 / len(POINTS)), scene.moments.on_curves
+    way_s = scene.moments.way_s
 
     def of_row(run: int, row: int, amount: FloatArray) -> tuple[FloatArray, FloatArray]:
         m, on_ramp = divmod(row, 2)
@@ -179,9 +179,9 @@ def _stuck_onsets(
         if curved[run, m]:
             by_chance = scene.moments.late[run, m, 0, motor] + scene.moments.bent[run, m, 0, motor]
             width = np.sqrt(deviation**2 + scatter**2 + by_chance)
-            told = scene.moments.behind[run, m, motor] + goal[run, m]
-            end = scene.moments.time[run, m]
-            return _on_a_curve(told, (end - length[run, m, 1], end), held, width, lag)
+            way, when = scene.moments.way[run, m, motor], way_s[run, m]
+            told = when, goal[run, m] + way - way[-1]
+            return _on_a_curve(told, length[run, m, 1], held, width, lag)
         passed = (held - first) / travel if abs(travel) > STILL_RAD else np.inf
         if not -OFF_RAMP < passed < 1.0 + OFF_RAMP:
             return parts.ravel()[::2], share
@@ -194,22 +194,21 @@ def _stuck_onsets(
 
 
 def _on_a_curve(
-    told: FloatArray, between: tuple[float, float], held: float, width: float, lag_s: float
+    told: tuple[FloatArray, FloatArray], since_s: float, held: float, width: float, lag_s: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return onsets before a moment on a curve [s] and their shares: when the motor was there.
 
     Args:
-        told: Where it would be at the moment if it followed `AGES_S` later, (age,) [rad].
-        between: When its stretch begins and ends [s].
+        told: When [s] it would be where [rad] up to that moment if it were not held, (sample,).
+        since_s: How long before it its stretch begins [s].
         held: Held angle [rad].
         width: Deviation of the motor from it where it stopped [rad].
         lag_s: Deviation of the lag [s].
     """
-    begin, end = between
-    age = np.linspace(0.0, min(AGES_S[-1], end - begin), AGES)
-    told = np.interp(age, AGES_S, told)
-    spread = np.hypot(width, np.gradient(told) / np.sqrt(12.0))  # and between two ages
-    there = width / spread * np.exp(-0.5 * ((held - told) / spread) ** 2)
+    age, (when, angle) = np.linspace(0.0, since_s, AGES), told
+    was = np.interp(when[-1] - age, when, angle)
+    spread = np.hypot(width, np.gradient(was) / np.sqrt(12.0))  # and between two ages
+    there = width / spread * np.exp(-0.5 * ((held - was) / spread) ** 2)
     share = np.repeat(there + LEAST_THERE, len(NORMAL_QUANTILES))
-    onset = end - age[:, None] + lag_s * NORMAL_QUANTILES
+    onset = when[-1] - age[:, None] + lag_s * NORMAL_QUANTILES
     return np.maximum(onset, 0.0).ravel(), share / share.sum()

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.core.movements import Stretches
+from failuretwin.core.movements import WAY_SAMPLES, Stretches
 from failuretwin.core.numerics import log_of
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.observation.command_loss import CommandOutcomes
@@ -57,8 +57,8 @@ class Moments:
         done: Share of the movement that each motor had made, (run, moment, motor).
         kept: Probability that what became of the moment before holds on, (run, moment): 1 in one
             ramp, 0 with a new movement.
-        behind: How far a motor that follows `AGES_S` later is behind the command, (run, moment,
-            motor, age) [rad]; 0 at rest.
+        way: Command that shows from the moment before up to each, evenly in time; the first from
+            0 on, (run, moment, motor, sample) [rad]; 0 where no run is on its way.
     """
 
     point: FloatArray
@@ -79,7 +79,7 @@ class Moments:
     late: FloatArray
     done: FloatArray
     kept: FloatArray
-    behind: FloatArray
+    way: FloatArray
 
     @property
     def bent(self) -> FloatArray:
@@ -89,6 +89,14 @@ class Moments:
     def trailing(self, lag_s: FloatArray) -> Moments:
         """Return the same of motors that trail their commands by more, (motor,) [s]."""
         return replace(self, base=self.base - self.speed * lag_s)
+
+    @property
+    def way_s(self) -> FloatArray:
+        """When the samples of `way` show, (run, moment, sample) [s]."""
+        time = np.maximum.accumulate(self.time, axis=1)
+        before = np.concatenate([np.zeros_like(time[:, :1]), time[:, :-1]], axis=1)
+        share = (np.arange(WAY_SAMPLES) + 1.0) / WAY_SAMPLES
+        return np.asarray(before[..., None] + (time - before)[..., None] * share)
 
     @property
     def on_curves(self) -> BoolArray:
@@ -151,7 +159,7 @@ def moments_of(model: HealthyModel, evidence: SettledEvidence) -> Moments:
         late=(speed * model.start_jitter_s) ** 2,
         done=movements.done,
         kept=_kept(movements, way),
-        behind=np.nan_to_num(movements.before - movements.before[..., :1]),
+        way=np.nan_to_num(movements.way),
     )
     late = np.maximum(model.late(movements, evidence.first_reading_delay), LATE_RATE)
     return _with_waiting(found, np.where(way & movements.whole, late, 0.0))

@@ -86,13 +86,17 @@ def best_sizes(
         alike: Whether the angle does not depend on the row.
     """
     low, high = sizes.ends
-    grid = coarse_sizes(low, high)
-    grid = np.concatenate([-grid[::-1], grid]) if signed else grid
-    grid = np.tile(grid, (moving.scene.moments.runs, 1))
+    grid = np.tile(size_grid(sizes, signed), (moving.scene.moments.runs, 1))
     best, least = moving.best(grid, alike), -high if signed else low
     x = moving.refined(best, np.full((1, 1), least), np.full((1, 1), high))
     slope = np.sqrt(np.mean(moving.slope(x, ARRIVED) ** 2, axis=-1))
     return x, np.minimum(FREE_RAD / np.maximum(slope, 1e-6), 0.5 * high) ** 2
+
+
+def size_grid(sizes: SizePrior, signed: bool) -> FloatArray:
+    """Return sizes to look at, of both signs if they are signed, ascending, (node,)."""
+    grid = coarse_sizes(*sizes.ends)
+    return np.concatenate([-grid[::-1], grid]) if signed else grid
 
 
 def moment_intervals(scene: Scene) -> OnsetIntervals:

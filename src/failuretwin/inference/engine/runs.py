@@ -30,7 +30,7 @@ from failuretwin.inference.engine.picks import Part, Picks, Prepared, narrowed, 
 from failuretwin.inference.engine.redrawn_rows import redrawn_rows
 from failuretwin.inference.engine.rows import Rows, Scene
 from failuretwin.inference.engine.theta import Components
-from failuretwin.inference.engine.transient_rows import transient_rows
+from failuretwin.inference.engine.way_rows import way_rows
 
 AMOUNT_STEPS = np.linspace(-4.0, 4.0, 33)
 """Nodes at which the prior of an amount is put in, in posterior deviations."""
@@ -114,8 +114,8 @@ def rows_of(scene: Scene, hypothesis: Hypothesis) -> Rows:
         return held_rows(scene, motor)
     if mode.signature is Signature.REDRAWN_OFFSET:
         return redrawn_rows(scene, motor, mode)
-    if mode.signature is Signature.TRANSIENT:
-        return transient_rows(scene, motor, mode)
+    if mode.signature is Signature.TRANSIENT or (mode.hysteresis and scene.layout.moving):
+        return way_rows(scene, motor, mode)
     return offset_rows(scene, motor, mode)
 
 

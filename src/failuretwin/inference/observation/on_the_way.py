@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from failuretwin.core.compiled import compiled
-from failuretwin.core.movements import AGES_S, Stretches
+from failuretwin.core.movements import WAY_SAMPLES, Stretches
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.inference.observation.between_commands import strays_between
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
@@ -84,7 +84,6 @@ class _Moment:
     done: FloatArray
     whole: bool
     curved: bool
-    before: FloatArray
 
 
 def hardly_rest(evidence: Evidence, model: HealthyModel) -> BoolArray:
@@ -151,7 +150,7 @@ def on_the_way(evidence: Evidence, model: HealthyModel, lag_s: float) -> Settled
     found = {(run, m): looks.moments(run, m) for run, m in np.argwhere(unseen).tolist()}
     if not any(found.values()):
         return settled
-    return _joined(settled, found, lag_s)
+    return _with_ways(_joined(settled, found, lag_s), evidence, lag_s)
 
 
 def _arriving(settled: SettledEvidence, lag_s: float) -> BoolArray:
@@ -243,7 +242,6 @@ class _Looks:
             else np.ones_like(ramp),
             not curved,
             curved,
-            told(time[at] - AGES_S).T,
         )
 
     def _friction(self, run: int, when: float) -> FloatArray:
@@ -308,7 +306,7 @@ def _joined(
     count = max(len(one) for one in plan)
     motors, axes = movements.initial.shape[1], settled.point.shape[-1]
     made = SettledEvidence.empty(run=len(plan), movement=count, motor=motors, axis=axes)
-    stretches = Stretches.empty(run=len(plan), movement=count, motor=motors, age=len(AGES_S))
+    stretches = Stretches.empty(run=len(plan), movement=count, motor=motors, sample=WAY_SAMPLES)
     stretches.initial[:] = movements.initial
     for run, told in enumerate(plan):
         for k, (m, moment) in enumerate(told):
@@ -325,6 +323,24 @@ def _joined(
     return replace(made, movements=stretches)
 
 
+def _with_ways(seen: SettledEvidence, evidence: Evidence, lag_s: float) -> SettledEvidence:
+    """Return moments with the commands that show from one to the next; the first from the start on.
+
+    Args:
+        seen: The moments.
+        evidence: What the runs say.
+        lag_s: How far the tool trails its commands [s].
+    """
+    stretches = Stretches.of(seen.movements)
+    time = np.maximum.accumulate(np.nan_to_num(0.5 * (seen.begin + seen.end)), axis=1)
+    begin = np.concatenate([np.zeros_like(time[:, :1]), time[:, :-1]], axis=1)
+    share = (np.arange(WAY_SAMPLES) + 1.0) / WAY_SAMPLES
+    when = begin[..., None] + (time - begin)[..., None] * share  # (run, moment, sample)
+    for run, at in enumerate(when - lag_s):
+        stretches.way[run] = np.moveaxis(command_at(evidence, run, at), 2, 1)
+    return replace(seen, movements=stretches)
+
+
 def _put(made: SettledEvidence, stretches: Stretches, at: tuple[int, int], moment: _Moment) -> None:
     made.point[at], made.usable[at], made.moving[at] = moment.point, True, False
     made.begin[at] = made.end[at] = moment.time
@@ -333,7 +349,7 @@ def _put(made: SettledEvidence, stretches: Stretches, at: tuple[int, int], momen
     stretches.speed[at], stretches.at_rest[at] = moment.speed, False
     stretches.whole[at], stretches.curved[at] = moment.whole, moment.curved
     stretches.bend[at], stretches.done[at] = moment.bend, moment.done
-    stretches.direction[at], stretches.before[at] = moment.direction, moment.before
+    stretches.direction[at] = moment.direction
 
 
 def _put_rest(stretches: Stretches, at: tuple[int, int], before: _Moment, lag_s: float) -> None:

@@ -1,4 +1,4 @@
-"""Motors that are late or slow, seen on their way: against the twin that makes such faults."""
+"""Motors that follow another way than they are told: against the twin that makes such faults."""
 
 from dataclasses import replace
 
@@ -9,8 +9,9 @@ import failuretwin as ft
 from failuretwin.core.movements import find_movements
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import load_robot
+from failuretwin.failure_behavior.registry import MODES as MODES_BY_NAME
 from failuretwin.inference.engine.moments import moments_of
-from failuretwin.inference.engine.transient_rows import Ramps
+from failuretwin.inference.engine.way_rows import FollowedWay, Ramps
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.on_the_way import on_the_way
@@ -82,3 +83,89 @@ def test_a_healthy_arm_is_neither():
     transient = sum(p for h, p in found.posterior.items() if str(h).endswith(("lag", "slow")))
     assert str(found.diagnosis) == "healthy"
     assert transient < 0.1
+
+
+# Along streamed curves.
+
+
+def curve():
+    """A smooth way without a stop: times (time,) and commands (time, motor)."""
+    time = STEP_S * np.arange(901)
+    phase = np.array([0.3, 1.1, 2.0, 2.9])
+    wave = np.sin(1.9 * time[:, None] + phase) + 0.6 * np.sin(0.8 * time[:, None] + 2.0 * phase)
+    return time, 0.55 * wave
+
+
+def limited(command, most):
+    """Where a motor gets that moves by so much a step at most."""
+    found = command.copy()
+    for k in range(1, len(found)):
+        found[k] = found[k - 1] + np.clip(command[k] - found[k - 1], -most, most)
+    return found
+
+
+def with_play(command, play):
+    """Where a joint stands that its motor drags through a play."""
+    found = command.copy()
+    for k in range(1, len(found)):
+        found[k] = np.clip(found[k - 1], command[k] - 0.5 * play, command[k] + 0.5 * play)
+    return found
+
+
+def broken(command, motor, onset, made):
+    """Commands of which one motor makes something else from a sample on."""
+    found = command.copy()
+    found[onset:, motor] = made(command[onset:, motor])
+    return found
+
+
+def largest_step(values):
+    return np.abs(np.diff(values)).max()
+
+
+CURVED = ["healthy", *(f"motor_{k}:{m}" for k in (1, 2, 3) for m in (*MODES, "backlash"))]
+
+
+def test_a_motor_that_lost_speed_is_found_on_a_curve():
+    _, command = curve()
+    followed = broken(command, 1, 0, lambda way: limited(way, 0.5 * largest_step(way)))
+    runs = exact_run(ROBOT, command, followed)
+    (found,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=CURVED)
+    assert str(found.diagnosis) == "motor_2:slow"
+    assert found.magnitude == pytest.approx(0.5, abs=0.08)
+
+
+def test_a_joint_with_play_is_found_on_a_curve():
+    _, command = curve()
+    followed = broken(command, 1, 300, lambda way: with_play(way, 0.14))
+    runs = exact_run(ROBOT, command, followed)
+    (found,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=CURVED)
+    assert str(found.diagnosis) == "motor_2:backlash"
+    assert found.magnitude == pytest.approx(0.14, abs=0.03)
+    assert found.onset_90[0] - 0.1 <= 3.0 <= found.onset_90[1]  # it shows once it turns
+
+
+@pytest.mark.parametrize(
+    ("mode", "size", "made"),
+    [
+        ("backlash", 0.1, lambda way: with_play(way, 0.1)),
+        ("slow", 0.4, lambda way: limited(way, 0.6 * largest_step(curve()[1][:, 1]))),
+        ("lag", 0.2, lambda way: np.concatenate([np.full(20, way[0]), way[:-20]])),
+        ("encoder_scale", -0.2, lambda way: 0.8 * way),
+    ],
+)
+def test_a_fault_changes_the_way_as_it_does_in_the_twin(mode, size, made):
+    _, command = curve()
+    healthy = HealthyModel.of(load_calibration("generic", ROBOT))
+    evidence = Evidence(exact_run(ROBOT, command, command), healthy.settings, healthy.sensors).sound
+    moments = moments_of(healthy, on_the_way(evidence, healthy, healthy.lag_s))
+    sizes = np.sort([size, 0.5 * size, 1.5 * size])
+    way = FollowedWay.of(moments, 1, MODES_BY_NAME[mode], sizes, np.array([0, 4]))
+    off = way.at(np.full((1, 2, 1), size))[0, :, :, 0]
+    at, step = np.rint((moments.time[0] - healthy.lag_s) / STEP_S).astype(int), 0.012
+    for row, onset in enumerate((0, at[3])):
+        followed = broken(command, 1, onset, made)
+        wanted = (followed - command)[at, 1]
+        assert np.abs(wanted).max() > 3.0 * step
+        counts = np.arange(len(at)) >= (0, 5)[row]  # that at the onset itself is on its way
+        np.testing.assert_allclose(off[row][counts], wanted[counts], atol=step)

@@ -1,10 +1,13 @@
-"""A motor that follows its command later, or makes its ramps more slowly, seen on its way.
+"""A motor with a fault that changes its way: it lags, is slow, has play or follows another law.
 
-    late by z:    q(t - z)
-    slow:         begin + (goal - begin) min(1, (t - start) / (k ramp)),    k the ramp factor
+    off(z; t) = F_z[command](t) - command(t)
 
-A slow motor goes for the goal of each movement from where the movement before left it. On a curve
-the way from one moment to the next counts as such a movement.
+with F_z the mode's own failure behavior (`on_curve`) at size z, from the onset on; between some
+sizes it is interpolated. A slow motor makes its ramps in k times their duration:
+
+    begin + (goal - begin) min(1, (t - start) / (k ramp))
+
+It goes for the goal of each ramp from where the ramp before left it.
 
 Section: docs/inference.md#moments-on-the-way
 """
@@ -15,9 +18,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.core.movements import AGES_S
 from failuretwin.core.numerics import log_of
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
+from failuretwin.failure_behavior.fault import STEP, Course, FaultGroup
 from failuretwin.failure_behavior.mode import FaultMode
 from failuretwin.inference.engine.moments import Moments
 from failuretwin.inference.engine.moved_motor import Angle, MovedMotor, taken
@@ -25,6 +28,7 @@ from failuretwin.inference.engine.offset_rows import (
     best_sizes,
     moment_intervals,
     movement_intervals,
+    size_grid,
     size_prior,
 )
 from failuretwin.inference.engine.rows import Rows, Scene, sampled
@@ -33,60 +37,102 @@ LEAST_S = 1e-6
 """Shortest time that is divided by [s]."""
 
 
-def transient_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
-    """Return the rows of a motor that is later or slower, with each onset."""
+def way_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
+    """Return the rows of a motor that follows another way than it is told, with each onset."""
     early = scene.priors.onset.before_run(mode.mode)
     sizes = scene.priors.sizes_of(mode, scene.model, motor)
     slow = bool(mode.ramp_factor(np.array(sizes.ends))[1] != 1.0)  # from the next movement on
     intervals = movement_intervals(scene) if slow else moment_intervals(scene)
-    first = np.arange(scene.moments.count)
-    moving = MovedMotor(scene, motor, False, _angle(scene, motor, mode, first), first)
+    first, grid = np.arange(scene.moments.count), size_grid(sizes, mode.signed)
+    way = FollowedWay.of(scene.moments, motor, mode, grid, first)
+    ramps = Ramps.of(scene.moments, motor, scene.model.lag_s) if slow else None
+    angle = _angle(scene, motor, mode, way, ramps, first)
+    moving = MovedMotor(scene, motor, False, angle, first)
     best = best_sizes(moving, sizes, mode.signed, alike=False)
     log_prior, onsets = log_of(intervals.weights(early)), sampled(*intervals.samples(early))
     return moving.rows(*best, log_prior, size_prior(sizes, mode.signed), onsets)
 
 
-def _angle(scene: Scene, motor: int, mode: FaultMode, first: IntArray) -> Angle:
+def _angle(
+    scene: Scene,
+    motor: int,
+    mode: FaultMode,
+    way: FollowedWay,
+    ramps: Ramps | None,
+    first: IntArray,
+) -> Angle:
     """Return the angle of a motor on its way by the size of its fault.
 
     Args:
         scene: The runs.
         motor: Index of the motor.
-        mode: Its mode.
+        mode: Mode of the fault.
+        way: By how much it is off.
+        ramps: Its ramps, which it makes more slowly; None: it does not.
         first: First moment affected in each row, (row,).
     """
-    ramps = Ramps.of(scene.moments, motor, scene.model.lag_s)
-    behind, lost = scene.moments.behind[:, :, motor], as_floats(scene.moments.lost)
+    lost, curve = as_floats(scene.moments.lost), scene.moments.on_curves[:, None, :, None]
 
     def angle(x: FloatArray, outcome: IntArray) -> FloatArray:
-        factor, late_s = (
-            of(x.ravel()).reshape(x.shape) for of in (mode.ramp_factor, mode.dead_time)
-        )
-        off = _late(behind, late_s)
-        if (factor != 1.0).any():
-            off = off + ramps.off(factor, first)
+        off = way.at(x)
+        if ramps is not None:
+            factor = mode.ramp_factor(x.ravel()).reshape(x.shape)
+            off = np.where(curve, off, ramps.off(factor, first))
         settled, missed = (taken(values, outcome)[..., motor] for values in (scene.pose, lost))
         return settled[..., None] + (1.0 - missed[..., None]) * off
 
     return angle
 
 
-def _late(behind: FloatArray, late_s: FloatArray) -> FloatArray:
-    """Return by how much a motor is off that follows its command later.
+@dataclass(frozen=True)
+class FollowedWay:
+    """By how much a motor is off at the moments of some runs.
 
-    Args:
-        behind: How far it is behind the command if it follows `AGES_S` later, (run, moment, age)
-            [rad].
-        late_s: How much later, (run, row, node) [s].
-
-    Returns:
-        (run, row, moment, node) [rad].
+    Attributes:
+        sizes: Sizes of its fault, ascending, (size,).
+        off: At each size, (run, row, moment, size) [rad].
     """
-    place = np.interp(late_s, AGES_S, np.arange(len(AGES_S), dtype=np.float64))
-    low = np.minimum(place.astype(np.int64), len(AGES_S) - 2)
-    run = np.arange(len(behind))[:, None, None]
-    before, after = (behind[run, :, low + k] for k in (0, 1))  # (run, row, node, moment)
-    return np.swapaxes(before + (place - low)[..., None] * (after - before), 2, 3)
+
+    sizes: FloatArray
+    off: FloatArray
+
+    @classmethod
+    def of(
+        cls, moments: Moments, motor: int, mode: FaultMode, sizes: FloatArray, first: IntArray
+    ) -> FollowedWay:
+        """Return what a fault makes of the way of a motor.
+
+        Args:
+            moments: The moments.
+            motor: Index of the motor.
+            mode: Mode of the fault.
+            sizes: Ascending, (size,).
+            first: First moment affected in each row, (row,): the fault begins with the way to it.
+        """
+        told_s = moments.way_s
+        time = told_s[..., -1]
+        begin = np.concatenate([np.zeros_like(time[:, :1]), time[:, :-1]], axis=1)
+        off = np.zeros((moments.runs, len(first), moments.count, len(sizes)))
+        magnitude = np.tile(sizes, len(first))
+        for run, way in enumerate(moments.way[:, :, motor]):
+            grid = np.linspace(0.0, max(time[run, -1], 1.0), way.size)
+            reference = np.interp(grid, told_s[run].ravel(), way.ravel())
+            courses = [Course(STEP, s) for s in begin[run, first].repeat(len(sizes)).tolist()]
+            faults = FaultGroup(magnitude, courses)
+            told = np.broadcast_to(reference, (len(magnitude), len(grid)))
+            away = mode.on_curve(faults, told, grid) - told
+            place = time[run] / grid[1]
+            low = np.minimum(place.astype(np.int64), len(grid) - 2)
+            found = away[:, low] + (place - low) * (away[:, low + 1] - away[:, low])
+            off[run] = np.swapaxes(found.reshape(len(first), len(sizes), -1), 1, 2)
+        return cls(sizes, off)
+
+    def at(self, x: FloatArray) -> FloatArray:
+        """Return it at other sizes, (run, row, node), as (run, row, moment, node) [rad]."""
+        place = np.interp(x, self.sizes, np.arange(len(self.sizes), dtype=np.float64))
+        low = np.minimum(place.astype(np.int64), len(self.sizes) - 2)
+        before, after = (np.take_along_axis(self.off, low[:, :, None] + k, axis=3) for k in (0, 1))
+        return np.asarray(before + (place - low)[:, :, None] * (after - before))
 
 
 @dataclass(frozen=True)
