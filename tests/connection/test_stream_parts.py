@@ -341,3 +341,13 @@ def test_the_documented_sink_is_one(own_module, capsys):
 def test_what_is_no_source_is_refused(armpi, text, trouble):
     with pytest.raises(InputError, match=f"source '{text}': .*{trouble}"):
         source_from_text(text, armpi)
+
+
+def test_a_source_without_its_address_is_refused(armpi, tmp_path, monkeypatch):
+    text = "def Port(robot, address):\n    open(address)\n"
+    (tmp_path / "own_port.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(
+        InputError, match=r"'own_port:Port:/dev/none' could not be opened: .*No such"
+    ):
+        source_from_text("own_port:Port:/dev/none", armpi)

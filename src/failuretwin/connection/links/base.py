@@ -272,7 +272,8 @@ def source_from_text(text: str, robot: Robot) -> Source:
         robot: The robot, the first argument of the class.
 
     Raises:
-        InputError: If there is no such class, or its instance is not a source.
+        InputError: If there is no such class, its instance is not a source, or it finds nothing at
+            its address.
     """
     module, _, rest = text.partition(":")
     name, *address = rest.split(":", 1)
@@ -285,5 +286,9 @@ def source_from_text(text: str, robot: Robot) -> Source:
         raise InputError(
             f"source {text!r}: {error}. Expected MODULE:CLASS, a class such as the docstring of "
             "failuretwin.connection.links.base.Source shows, in a module that Python finds."
+        ) from error
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"source {text!r} could not be opened: {error}. Check what follows its class."
         ) from error
     return cast(Source, made)
