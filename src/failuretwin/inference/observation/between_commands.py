@@ -17,7 +17,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.lag_offset import command_at
@@ -62,7 +62,7 @@ def strays_between(
     """
     found: BoolArray = np.zeros(len(runs), dtype=bool)
     for run in np.flatnonzero(runs).tolist():
-        command, time = (as_floats(evidence.runs[n].values) for n in ("command", "time"))
+        command, time = evidence.command, evidence.time
         corners = _corners(command[run], time)
         steady = len(corners) > FEWEST and _steady(corners)
         least, share = (LEAST_STEADY_S, SHARE_STEADY) if steady else (LEAST_S, SHARE)
@@ -83,7 +83,7 @@ def _off(
         Both, and the deviation of a healthy arm there, (stretch,) [m].
     """
     seen = np.flatnonzero(evidence.read[run])
-    when = as_floats(evidence.runs["time"].values)[seen] - lag_s
+    when = evidence.time[seen] - lag_s
     expected, jacobian = model.sensors.expected(command_at(evidence, run, when))
     off = np.linalg.norm(evidence.readings.point[run][seen] - expected, axis=-1)
     spread = np.sum((jacobian * model.scatter) ** 2, axis=(-2, -1)) + 3.0 * model.path_noise**2

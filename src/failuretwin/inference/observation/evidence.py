@@ -63,6 +63,16 @@ class Evidence:
     sensors: SensorStack | None = None
 
     @cached_property
+    def time(self) -> FloatArray:
+        """The grid of the runs, (time,) [s]."""
+        return as_floats(self.runs["time"].values)
+
+    @cached_property
+    def command(self) -> FloatArray:
+        """What the motors were told, (run, time, motor) [rad]."""
+        return as_floats(self.runs["command"].values)
+
+    @cached_property
     def readings(self) -> MeasuredSamples:
         """The readings behind the samples of the run set."""
         return self.sensors.read(self.runs) if self.sensors else measured_samples(self.runs)
@@ -85,8 +95,8 @@ class Evidence:
     @cached_property
     def settled(self) -> SettledEvidence:
         """Where the tool settled after each movement; lines drawn between readings do not count."""
-        time, readings = as_floats(self.runs["time"].values), self.readings
-        movements = find_movements(as_floats(self.runs["command"].values), time)
+        time, readings = self.time, self.readings
+        movements = find_movements(self.command, time)
         end = _plateau_ends(movements, readings.point, time)
         begin = rest_begin(movements.start, movements.ramp_duration, end)
         silence = SILENT_PERIODS / measured_rate(self.runs)
@@ -119,7 +129,7 @@ class Evidence:
         Of densely sampled paths readings are left out evenly, so that no two lie closer than the
         true rate of the sensor says; samples on lines drawn between readings do not count.
         """
-        time, settled, readings = as_floats(self.runs["time"].values), self.settled, self.readings
+        time, settled, readings = self.time, self.settled, self.readings
         read, least_step = self.read, 0.9 / measured_rate(self.runs)
         start, until = settled.movements.start, settled.transient_until
         points = self.sensors.read_on_way(self.runs, readings) if self.sensors else readings.point

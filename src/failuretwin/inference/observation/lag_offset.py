@@ -70,7 +70,7 @@ class _Way:
     def log_density(self, run: int, shifts: FloatArray) -> FloatArray:
         """Return the log density of the readings of a run at some shifts, up to a constant."""
         model, seen = self.model, self._looked_at(run)
-        time = as_floats(self.evidence.runs["time"].values)[seen]
+        time = self.evidence.time[seen]
         when = time[:, None] - model.lag_s - shifts
         told, before, after = (
             command_at(self.evidence, run, when + h) for h in (0.0, -CORNER_S, CORNER_S)
@@ -89,7 +89,7 @@ class _Way:
 
     def _looked_at(self, run: int) -> IntArray:
         """Return readings while motors are told to move, evenly spread."""
-        evidence, time = self.evidence, as_floats(self.evidence.runs["time"].values)
+        evidence, time = self.evidence, self.evidence.time
         movements, end = evidence.settled.movements, evidence.settled.end[run]
         moves: BoolArray = np.zeros(len(time), dtype=bool)
         for m in np.flatnonzero(movements.exists[run]).tolist():
@@ -101,5 +101,5 @@ class _Way:
 
 def command_at(evidence: Evidence, run: int, when: FloatArray) -> FloatArray:
     """Return the command of a run at some times (...) [s], as (..., motor) [rad]."""
-    time, command = (as_floats(evidence.runs[name].values) for name in ("time", "command"))
-    return np.stack([np.interp(when, time, one) for one in command[run].T], axis=-1)
+    told = evidence.command[run].T
+    return np.stack([np.interp(when, evidence.time, one) for one in told], axis=-1)

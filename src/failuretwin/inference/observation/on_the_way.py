@@ -23,7 +23,7 @@ import numpy as np
 
 from failuretwin.core.compiled import compiled
 from failuretwin.core.movements import WAY_SAMPLES, Stretches
-from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.observation.between_commands import strays_between
 from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
 from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -181,7 +181,7 @@ class _Looks:
         """Return the moments on the way of a movement."""
         settled, lag = self.evidence.settled, self.lag_s
         movements = settled.movements
-        time, read = as_floats(self.evidence.runs["time"].values), self.evidence.read[run]
+        time, read = self.evidence.time, self.evidence.read[run]
         start, end = movements.start[run, m], settled.end[run, m]
         seen = np.flatnonzero(read & (time > start + lag) & (time < end - 1e-9))
         if not len(seen):
@@ -209,7 +209,7 @@ class _Looks:
     def _moment(
         self, run: int, m: int, at: int, begin: float, early: float, curved: bool
     ) -> _Moment:
-        time = as_floats(self.evidence.runs["time"].values)
+        time = self.evidence.time
         start = self.evidence.settled.movements.start[run, m]
         end, lag = self.evidence.settled.end[run, m], self.lag_s
 
@@ -250,21 +250,16 @@ class _Looks:
         A motor that turns back yields by its friction f to one side, then to the other:
         d <- clip(d + dq / f, -1, 1) along the command q, a play of width 2 f.
         """
-        time, command = self._told(run)
-        steps = np.diff(command[time <= when], axis=0)
+        command = self.evidence.command[run]
+        steps = np.diff(command[self.evidence.time <= when], axis=0)
         width = np.maximum(np.asarray(self.model.settling.friction), LEAST_FRICTION_RAD)
         found = np.zeros(command.shape[1])
         _follow(steps / width, found)
         return found
 
-    def _told(self, run: int) -> tuple[FloatArray, FloatArray]:
-        """Return the time grid (time,) [s] and the command of a run, (time, motor) [rad]."""
-        runs = self.evidence.runs
-        return as_floats(runs["time"].values), as_floats(runs["command"].values[run])
-
     def _near(self, run: int, at: int) -> IntArray:
         """Return the readings about one, as many before as after: what a fault adds cancels."""
-        time = as_floats(self.evidence.runs["time"].values)
+        time = self.evidence.time
         near = np.flatnonzero(self.evidence.read[run] & (np.abs(time - time[at]) <= POOLED_S))
         place = int(np.searchsorted(near, at))
         count = min(place, len(near) - 1 - place)
@@ -273,7 +268,7 @@ class _Looks:
 
 def _is_curved(evidence: Evidence, run: int, m: int) -> bool:
     """Return whether the command of a movement strays from straight ramps."""
-    settled, time = evidence.settled, as_floats(evidence.runs["time"].values)
+    settled, time = evidence.settled, evidence.time
     start, end = settled.movements.start[run, m], settled.end[run, m]
     when = time[(time >= start) & (time <= end)]
     straight = settled.movements[run : run + 1].reference(when)[0]

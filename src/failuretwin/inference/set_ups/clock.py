@@ -167,13 +167,13 @@ def clock_posterior(seen: Evidence, model: HealthyModel) -> ClockPosterior:
 
 def _ways(seen: Evidence, model: HealthyModel) -> list[Way]:
     """Return the readings about the movements of some runs."""
-    time, command = as_floats(seen.runs["time"].values), seen.runs["command"].values
+    time, command = seen.time, seen.command
     known: Movements = seen.settled.movements
     some = np.unique(np.linspace(0, len(command) - 1, LOOKED_AT).astype(np.int64))
     found = []
     for run in some:
         read = seen.readings.seen[run]
-        predicted = model.twin.path(as_floats(command[run]))
+        predicted = model.twin.path(command[run])
         point, at = seen.readings.point[run][read], time[read]
         starts = known.start[run][known.exists[run]]
         for m, start in enumerate(starts):
