@@ -3,9 +3,11 @@
 import importlib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.special import logsumexp
 
 import failuretwin as ft
@@ -19,11 +21,18 @@ from failuretwin.digital_model.nonidealities import Readings
 from failuretwin.digital_model.robot import _assembled, load_robot
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.moments import moments_of
+from failuretwin.inference.engine.offset_rows import size_prior
+from failuretwin.inference.engine.picks import Picks
 from failuretwin.inference.engine.posterior import marginal_likelihoods, theta_posterior
 from failuretwin.inference.engine.redrawn_rows import redrawn_rows
 from failuretwin.inference.engine.registration import robot_posterior
 from failuretwin.inference.engine.rows import Scene
-from failuretwin.inference.engine.runs import has_rows
+from failuretwin.inference.engine.runs import (
+    AMOUNT_STEPS,
+    FAR_STEPS,
+    _with_amount_prior,
+    has_rows,
+)
 from failuretwin.inference.engine.theta import (
     AS_TOLD,
     SINCE_CALIBRATED,
@@ -32,6 +41,7 @@ from failuretwin.inference.engine.theta import (
     layout_of,
     robot_components,
 )
+from failuretwin.inference.faults.fault_sizes import SizePrior
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -316,3 +326,25 @@ def test_a_run_is_judged_alone(runs, uncalibrated):
         np.testing.assert_allclose(
             alone.by_hypothesis[0], uncalibrated.by_hypothesis[run], rtol=1e-9, atol=1e-9
         )
+
+
+@pytest.mark.parametrize(("mean", "deviation"), [(0.3, 0.05), (0.12, 0.02), (-0.2, 0.02)])
+def test_an_amount_beyond_its_range_keeps_its_tail(mean, deviation):
+    """Against the integral in full, also where nearly all of it lies where the prior is 0."""
+    low, high, width = 0.1, 0.5, 2.0
+    sizes = SizePrior(((low, high),), (1.0,))
+    one = np.ones((1, 1))
+    rows = SimpleNamespace(
+        variance=width**2 * one, centre=0.0 * one, amount_prior=size_prior(sizes, signed=False)
+    )
+    picks = Picks(*np.zeros((3, 1), dtype=np.int64))
+    found = [
+        _with_amount_prior(rows, picks, np.array([[mean, deviation**2]]), steps)
+        for steps in (AMOUNT_STEPS, FAR_STEPS)
+    ]
+    gain = next(float(gain[0]) for gain, _ in found if np.isfinite(gain[0]))
+
+    z = np.linspace(low, high, 200001)
+    log_height = stats.norm.logpdf(z, mean, deviation) - stats.norm.logpdf(z, 0.0, width)
+    wanted = logsumexp(log_height) + np.log((z[1] - z[0]) / (high - low))
+    assert gain == pytest.approx(wanted, abs=0.1 if mean > low else 0.6)

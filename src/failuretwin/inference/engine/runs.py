@@ -34,6 +34,8 @@ from failuretwin.inference.engine.way_rows import way_rows
 
 AMOUNT_STEPS = np.linspace(-4.0, 4.0, 33)
 """Nodes at which the prior of an amount is put in, in posterior deviations."""
+FAR_STEPS = np.linspace(-40.0, 40.0, 1281)
+"""The same where all of these are sizes that a fault cannot have."""
 WIDEST = 0.5
 """Largest deviation at which it is, as a share of that of the normal distribution it replaces."""
 ROWS_NATS, MOST_ROWS = 6.0, 3
@@ -340,7 +342,13 @@ class RunsEvidence:
         amount[:, 0] = found.amount[:, 0] + rows.centre[picks.run, picks.row]
         some = np.flatnonzero(rows.variance[picks.run, picks.row] > 0.0)
         if rows.amount_prior is not None and len(some):
-            gain, amount[some] = _with_amount_prior(rows, picks[some], found.amount[some])
+            gain = np.full(len(some), -np.inf)
+            for steps in (AMOUNT_STEPS, FAR_STEPS):
+                left = np.flatnonzero(~np.isfinite(gain))
+                at = some[left]
+                gain[left], amount[at] = _with_amount_prior(
+                    rows, picks[at], found.amount[at], steps
+                )
             total[some] += gain
         more, lossy = self._with_losses(part, found)
         return Weighed(picks, total + more, found, amount, lossy)
@@ -361,16 +369,23 @@ class RunsEvidence:
 
 
 def _with_amount_prior(
-    rows: Rows, picks: Picks, amount: FloatArray
+    rows: Rows, picks: Picks, amount: FloatArray, steps: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what the prior of the amount changes, (pick,), and mean and deviation, (pick, 2)."""
+    """Return what the prior of the amount changes, (pick,), and mean and deviation, (pick, 2).
+
+    Args:
+        rows: The rows.
+        picks: Some of them, with an amount.
+        amount: Its mean and variance by the readings, (pick, 2).
+        steps: Nodes, in deviations.
+    """
     run, row = picks.run, picks.row
     variance, centre = rows.variance[run, row], rows.centre[run, row]
     prior = np.sqrt(variance)
     middle = np.clip(amount[:, 0], -2.0 * prior, 2.0 * prior)
     deviation = np.sqrt(np.clip(amount[:, 1], 1e-16, (WIDEST * prior) ** 2))
-    z = middle[:, None] + deviation[:, None] * AMOUNT_STEPS
-    weight = -0.5 * AMOUNT_STEPS**2
+    z = middle[:, None] + deviation[:, None] * steps
+    weight = -0.5 * steps**2
     weight = weight - log_sum(weight, axis=0)
     normal = -0.5 * (z**2 / variance[:, None] + np.log(2.0 * np.pi * variance)[:, None])
     assert rows.amount_prior is not None
