@@ -22,7 +22,6 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import save_run_set
 from failuretwin.decision.learned.paper_study import (
     FEATURES,
-    PAGE,
     PLAN_FILE,
     WORK,
     Exam,
@@ -55,7 +54,7 @@ def studied(armpi, exam, tmp_path_factory):
     folder = tmp_path_factory.mktemp("study") / "out"
     told = []
     trainings = run_study(TINY, armpi, exam, folder, told.append)
-    write_study_page(trainings, TINY, armpi, exam, folder / PAGE)
+    write_study_page(trainings, TINY, armpi, exam, folder)
     return folder, sum(told)
 
 

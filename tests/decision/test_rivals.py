@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from failuretwin.app.reports.rivals_page import rivals_table, write_rivals
+from failuretwin.app.reports.study_page import rivals_table, write_rivals
 from failuretwin.core.errors import InputError
 from failuretwin.decision.benchmark.baselines import Displacement, KalmanBank, Readings
 from failuretwin.decision.benchmark.tasks import PREFIXES_S

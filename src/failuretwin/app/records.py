@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
@@ -10,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from failuretwin.app.terminal import Part, Table
+from failuretwin.app.terminal import SHOWN, Part, Table
 from failuretwin.core.errors import counted
 from failuretwin.data_knowledge.records.history import FaultEpisode, History, state_counts
 from failuretwin.data_knowledge.records.offsets import Drift
 from failuretwin.data_knowledge.records.queries import QueryAnswer
-from failuretwin.data_knowledge.store import filling
 
 
 def episode_line(episode: FaultEpisode) -> str:
@@ -58,8 +56,6 @@ def _episodes_table(episodes: Sequence[FaultEpisode]) -> Table:
     return Table(headings, rows, "rllllll", title="fault episodes")
 
 
-SHOWN = {"rad": (180.0 / math.pi, "deg"), "m": (1e3, "mm")}
-"""Factor and unit in which an angle or a length is shown."""
 BLOCKS = "▁▂▃▄▅▆▇█"
 
 
@@ -118,7 +114,7 @@ def write_history_page(history: History, folder: Path) -> None:
     Raises:
         OutputError: If it cannot be written; the folder is as before.
     """
-    from failuretwin.app.reports.plots import render_page
+    from failuretwin.app.reports.plots import write_index
 
     tone = "bad" if history.open_episodes else "good" if history.recent else "unknown"
     parts = history_parts(history)
@@ -128,6 +124,4 @@ def write_history_page(history: History, folder: Path) -> None:
         "tables": [part for part in parts if isinstance(part, Table)],
         "lines": [part for part in parts[1:] if isinstance(part, str) and part],
     }
-    text = render_page("history.html.j2", values)
-    with filling(folder) as partial:
-        (partial / "index.html").write_text(text, encoding="utf-8")
+    write_index("history.html.j2", values, folder)

@@ -5,6 +5,7 @@ Pages draw the same tables by the macro `table` of `base.html.j2`.
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -23,6 +24,10 @@ if TYPE_CHECKING:
 
 PIPE_WIDTH = 160
 """Columns when the output is not a terminal, so that sentences stay whole."""
+
+
+SHOWN = {"rad": (180.0 / math.pi, "deg"), "m": (1e3, "mm")}
+"""Factor and unit in which an angle or a length is shown."""
 
 
 def tell(text: str, *, err: bool = False) -> None:
@@ -84,18 +89,19 @@ def show(*parts: Part) -> None:
             continue
         if part.title:
             out.print(printable(part.title), soft_wrap=True)
-        out.print(_on_terminal(part))
+        out.print(drawn(part))
 
 
-def _on_terminal(table: Table) -> TerminalTable:
+def drawn(table: Table) -> TerminalTable:
+    """Return a table as a terminal shows it; its cells are text only."""
     from rich.table import Table as TerminalTable
 
-    drawn = TerminalTable(box=None, pad_edge=False, show_header=table.header)
+    made = TerminalTable(box=None, pad_edge=False, show_header=table.header)
     for heading, right in table.columns:
-        drawn.add_column(printable(heading), overflow="fold", justify="right" if right else "left")
+        made.add_column(printable(heading), overflow="fold", justify="right" if right else "left")
     for row in table.rows:
-        drawn.add_row(*map(printable, row))
-    return drawn
+        made.add_row(*map(printable, row))
+    return made
 
 
 def write_json(records: Iterable[Mapping[str, Any]], path: Path | None) -> None:

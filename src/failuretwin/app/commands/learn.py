@@ -263,16 +263,14 @@ def study(
     tell(f"{jobs} trainings of {plan.iterations} iterations each")
     with progress_bar("training", jobs) as advance:
         trainings = paper.run_study(plan, model, exam, out, advance)
-    page = out / paper.PAGE
-    write_study_page(trainings, plan, model, exam, page)
-    tell(f"written to {page}")
+    tell(f"written to {write_study_page(trainings, plan, model, exam, out)}")
 
 
 def _rivals(
     out: Path, test: Path | None, published_labels: bool, quick: bool, robot: opt.RobotOptions
 ) -> None:
     """Compare the rivals and write table and page."""
-    from failuretwin.app.reports.rivals_page import rivals_table, write_rivals
+    from failuretwin.app.reports.study_page import rivals_table, write_rivals
     from failuretwin.decision.learned import paper_study as paper
     from failuretwin.decision.rivals.plan import RivalPlan, quick_rivals, rival_jobs
     from failuretwin.decision.rivals.study import rival_scores, run_rivals

@@ -8,9 +8,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from failuretwin.app.reports.plots import render_page
+from failuretwin.app.reports.plots import write_index
 from failuretwin.app.terminal import Table
-from failuretwin.data_knowledge.store import write_text
 from failuretwin.decision.benchmark.real import real_sets
 from failuretwin.decision.benchmark.runner import REAL_ARM
 from failuretwin.decision.benchmark.simulated import ARMS, SETS, VERSION
@@ -120,7 +119,4 @@ def write_benchmark_page(entries: Sequence[Entry], folder: Path) -> Path:
         "sets": Table(("set", "content", "runs per hypothesis"), sets),
         "real": Table(("set", "content", "source", "licence"), real),
     }
-    path = folder / "index.html"
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(render_page("benchmark.html.j2", values), path)
-    return path
+    return write_index("benchmark.html.j2", values, folder)

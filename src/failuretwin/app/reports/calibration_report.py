@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.app.reports.plots import BLUE, GREY, clean, new_figure, png, render_page
+from failuretwin.app.reports.plots import BLUE, GREY, clean, new_figure, png, write_index
 from failuretwin.app.reports.technician_page import Section
 from failuretwin.app.terminal import Part, Table, figures_table
 from failuretwin.connection.calibration.cross_validation import (
@@ -27,7 +27,6 @@ from failuretwin.connection.tracked_diagnosis import Tracked
 from failuretwin.core.errors import counted
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.store import filling
 from failuretwin.digital_model.robot import Robot, shown_unit
 from failuretwin.inference.explanation import joint_names_in
 from failuretwin.inference.together.wear_limits import wear_unit
@@ -205,7 +204,7 @@ def write_calibration_page(
 ) -> None:
     """Write `index.html` into a folder; the runs are those learned from or judged on."""
     units, seen = robot.profile.servo_units, predict(found, runs, robot)
-    text = render_page(
+    write_index(
         "calibration.html.j2",
         {
             "found": found,
@@ -219,9 +218,8 @@ def write_calibration_page(
             "expected": png(expected_figure(seen, robot)) if seen.counts.any() else "",
             "unseen": seen.unseen,
         },
+        folder,
     )
-    with filling(folder) as partial:
-        (partial / "index.html").write_text(text, encoding="utf-8")
 
 
 # Robot behaviour learned from runs by `diagnose --self-calibrate` and `--track`.

@@ -12,8 +12,9 @@ import numpy as np
 
 from failuretwin.app.reports.isolability_report import sizes_of_motor
 from failuretwin.app.reports.technician_page import Section, write_page
-from failuretwin.app.terminal import Part, Table, figures_table
-from failuretwin.core.errors import InputError, counted
+from failuretwin.app.terminal import SHOWN, Part, Table, figures_table
+from failuretwin.core.errors import counted
+from failuretwin.core.foreign import reading
 from failuretwin.data_knowledge.store import filling, write_records
 from failuretwin.decision.robot_state import robot_state
 from failuretwin.decision.test_motions.health_check import OPEN, CheckResult
@@ -64,16 +65,15 @@ def write_check_page(results: Sequence[CheckResult], robot: Robot, folder: Path)
         write_page(diagnoses, state, robot, partial / "index.html", sections=measured)
 
 
-def _shown(slides: bool) -> tuple[float, str]:
-    """Return factor and name of the unit in which positions of a motor are shown."""
-    return (1e3, "mm") if slides else (180.0 / np.pi, "deg")
+def _unit(robot: Robot, k: int) -> str:
+    return "m" if robot.slides[k] else "rad"
 
 
 def motor_table(result: CheckResult, robot: Robot) -> Table:
     """Return zero and play of each motor, in degrees, of slides in millimetres."""
     found, shown, rows = result.offsets, result.shown, []
     for k, name in enumerate(robot.motor_names):
-        factor, unit = _shown(robot.slides[k])
+        factor, unit = SHOWN[_unit(robot, k)]
         rows.append([
             name,
             f"{result.by_motor.get(name, 0.0):.1%}",
@@ -105,7 +105,7 @@ def check_record(result: CheckResult, robot: Robot, seconds: float) -> dict[str,
                 "zero_deviation": float(found.zero_sd[k]),
                 "play": float(found.play[k]),
                 "play_deviation": float(found.play_sd[k]),
-                "unit": "m" if robot.slides[k] else "rad",
+                "unit": _unit(robot, k),
                 "shown_from": None if shown is None else shown.isolated.get(f"{name}:{ERROR}"),
             }
             for k, name in enumerate(robot.motor_names)
@@ -118,14 +118,10 @@ def check_record(result: CheckResult, robot: Robot, seconds: float) -> dict[str,
 
 def kept_checks(path: Path) -> list[dict[str, Any]]:
     """Return the checks of a kept file, the oldest first."""
-    try:
+    with reading(path, "kept checks", "Expected what `check --keep` wrote."):
         checks = json.loads(path.read_text(encoding="utf-8"))["checks"]
         _ = checks[-1]["date"], checks[-1]["motors"][0]["zero"]
         return list(checks)
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        raise InputError(
-            f"{path}: cannot be read as kept checks ({error}). Expected what `check --keep` wrote."
-        ) from error
 
 
 def keep_check(path: Path, motions: Motions, checks: Sequence[dict[str, Any]]) -> None:
@@ -141,7 +137,7 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
             moved = new[what] - old[what]
             spread = float(np.hypot(new[f"{what}_deviation"], old[f"{what}_deviation"]))
             if abs(moved) > CHANGED * spread:
-                factor, unit = _shown(new["unit"] == "m")
+                factor, unit = SHOWN[new["unit"]]
                 lines.append(
                     f"since {before['date'][:10]}: {what} of {new['motor']} changed by "
                     f"{factor * moved:+.2f} {unit} ({abs(moved) / spread:.1f} deviations)"
@@ -161,7 +157,7 @@ def motion_lines(motions: Motions, robot: Robot, written: Path | None = None) ->
     if written is not None:
         write_motions(motions, robot, written)
         saved = [f"written to {written}; nothing was moved"]
-    scales = [_shown(slides) for slides in robot.slides]
+    scales = [SHOWN[_unit(robot, k)] for k in range(len(robot.motors))]
     factor = np.array([scale for scale, _ in scales])
     rows = [
         [f"{k + 1}", f"{begin:.1f}", f"{ramp:.2f}", *(f"{x:.1f}" for x in factor * target)]

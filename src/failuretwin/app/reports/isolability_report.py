@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,15 +15,13 @@ from failuretwin.app.reports.plots import clean, new_figure, save_figure
 from failuretwin.app.terminal import Table, figures_table
 from failuretwin.core.errors import counted
 from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.runs import RunSet
 from failuretwin.core.types import as_floats
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import joint_names_in, plain_name, size_words
 from failuretwin.inference.isolability import IsolabilityReport, isolability
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 NARROWEST_IN = 5.0
 """Width of the picture below which its title does not fit [in]."""
@@ -144,9 +142,7 @@ WITHOUT_RESTS = (
 )
 
 
-def isolability_summary(
-    runs: xr.Dataset, diagnoser: BayesDiagnoser, options: str = ""
-) -> list[str]:
+def isolability_summary(runs: RunSet, diagnoser: BayesDiagnoser, options: str = "") -> list[str]:
     """Return which faults such motions cannot tell apart, and the smallest that they show.
 
     Args:

@@ -158,6 +158,18 @@ def render_page(template: str, values: Mapping[str, Any]) -> str:
     return pages.get_template(template).render(values)
 
 
+def write_index(template: str, values: Mapping[str, Any], folder: Path) -> Path:
+    """Write the page of a template into a folder as `index.html`, and return its path.
+
+    Raises:
+        OutputError: If it cannot be written; the folder is as before.
+    """
+    text = render_page(template, values)
+    with filling(folder) as partial:
+        (partial / "index.html").write_text(text, encoding="utf-8")
+    return folder / "index.html"
+
+
 # Reliability diagram.
 
 

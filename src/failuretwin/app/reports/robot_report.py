@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from failuretwin.app.reports.calibration_report import parameter_table
-from failuretwin.app.terminal import Part, Table
+from failuretwin.app.terminal import SHOWN, Part, Table
 from failuretwin.connection.registration.fit import Registration
 from failuretwin.core.errors import counted
 from failuretwin.digital_model.kinematics import has_range
@@ -58,7 +58,7 @@ def _joint_row(report: JointReport) -> tuple[str, ...]:
     joint = report.joint
     moving = joint.type not in ("fixed", "floating", "planar")
     slides = joint.type == "prismatic"
-    scale, unit = (1e3, "mm") if slides else (180.0 / math.pi, "deg")
+    scale, unit = SHOWN["m" if slides else "rad"]
     return (
         joint.name,
         joint.type,

@@ -1,4 +1,4 @@
-"""The study as one self-contained HTML page. Needs the extra `plots`."""
+"""The study, and that of rivals, as self-contained HTML pages. Needs the extra `plots`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy as np
 
 from failuretwin.app.reports import plots
 from failuretwin.app.reports.plots import BLUE, GREY, MM_PER_M, RED, SMALL
-from failuretwin.app.terminal import Table
+from failuretwin.app.reports.reports import latex
+from failuretwin.app.terminal import Table, figures_table
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.store import write_text
@@ -28,7 +29,10 @@ from failuretwin.decision.learned.paper_study import (
     mean_confusion,
     of_kind,
     ratio_spreads,
+    spread_of,
 )
+from failuretwin.decision.rivals.plan import RivalPlan
+from failuretwin.decision.rivals.study import RivalScores
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -149,9 +153,9 @@ def confusion_figure(shares: Mapping[str, FloatArray], classes: Sequence[str]) -
 
 
 def write_study_page(
-    trainings: Sequence[Training], plan: StudyPlan, robot: Robot, test: Exam, path: Path
-) -> None:
-    """Write the page with tables and figures of a finished study."""
+    trainings: Sequence[Training], plan: StudyPlan, robot: Robot, test: Exam, folder: Path
+) -> Path:
+    """Write the page with tables and figures of a finished study; return its path."""
     names = class_names(robot)
     values = {
         "plan": plan,
@@ -165,7 +169,7 @@ def write_study_page(
         "pictures": _pictures(trainings, plan, robot, test),
         "minutes": sum(training.seconds for training in trainings) / 60.0,
     }
-    write_text(plots.render_page("study.html.j2", values), path)
+    return plots.write_index("study.html.j2", values, folder)
 
 
 def _table_2(trainings: Sequence[Training], test: Exam) -> Table:
@@ -235,3 +239,68 @@ def _pictures(
         shares, [plots.plain(name) for name in class_names(robot)]
     )
     return {name: plots.png(figure) for name, figure in figures.items()}
+
+
+# Rivals of the paper's network: table, LaTeX and page.
+
+PUBLISHED_FIGURES = (
+    ("LSTM, published twin", "P0", "61.56 ± 5.59"),
+    ("CNN, published twin", "P0", "70.00"),
+    ("DANN", "P1", "80.22"),
+    ("TemporalTwinNet", "P1", "86.67"),
+    ("LSTM, five-fold transfer", "P2", "83.33 ± 7.86"),
+)
+"""Accuracy [%] on the authors' own 90 real runs of 2024-10-16; none gives a log score."""
+
+
+def rivals_table(scores: Sequence[RivalScores]) -> Table:
+    """Return a row for each method and twin."""
+    rows = []
+    for one in scores:
+        low, high = one.interval
+        gain, *ends = one.gain
+        test = "-" if (one.method, one.twin) == ("bayes", "imperfect") else f"{one.p:.2g}"
+        rows.append(
+            (
+                f"{one.method}, {one.twin} twin",
+                one.protocol,
+                percent(spread_of(one.accuracy)),
+                f"{100 * low:.0f} to {100 * high:.0f}",
+                f"{spread_of(one.nats).mean:.3f}",
+                f"{spread_of(one.errors).mean:.3f}",
+                f"{gain:.3f} ({ends[0]:.3f} to {ends[1]:.3f})" if math.isfinite(gain) else "inf",
+                test,
+                _delay(one),
+                f"{one.training_s:.0f}",
+                f"{one.run_ms:.1f}",
+            )
+        )
+    headings = (
+        *("method", "protocol", "correct [%]", "95 % interval", "log score [nats]", "ECE"),
+        *("Bayes saves [nats]", "McNemar p", "delay [s]; named, false [%]"),
+        *("training [s]", "a run [ms]"),
+    )
+    return figures_table(headings, rows)
+
+
+def _delay(one: RivalScores) -> str:
+    named, false = one.alarms
+    delay = f"{one.delay_s:.1f}" if math.isfinite(one.delay_s) else "-"
+    return f"{delay}; {named:.0f}, {false:.0f}"
+
+
+def write_rivals(
+    scores: Sequence[RivalScores], plan: RivalPlan, robot: Robot, exam: Exam, folder: Path
+) -> Path:
+    """Write `rivals.tex` and the page; return the path of the page."""
+    table = rivals_table(scores)
+    write_text("% \\usepackage{booktabs}\n" + latex(table), folder / "rivals.tex")
+    values = {
+        "plan": plan,
+        "robot": robot.name,
+        "test": exam,
+        "full": plan == RivalPlan(plan.seed),
+        "rivals": table,
+        "published": Table(("method", "protocol", "correct [%]"), PUBLISHED_FIGURES),
+    }
+    return plots.write_index("rivals.html.j2", values, folder)

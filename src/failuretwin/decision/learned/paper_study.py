@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from failuretwin.data_knowledge.readers.raw_sessions import As
 
 J = TypeVar("J")
-PLAN_FILE, WORK, PAGE = "study.json", "trainings", "index.html"
+PLAN_FILE, WORK = "study.json", "trainings"
 
 # Plan of the study.
 
