@@ -40,6 +40,7 @@ from nats.js.api import AckPolicy, ConsumerConfig
 
 from failuretwin.app.arms import emulation_with, known_arm
 from failuretwin.app.fleet import resolver
+from failuretwin.connection.emulated_arm import EmulatedFleet
 from failuretwin.connection.fleet.broker import (
     ALARM_STREAM,
     EVENTS_STREAM,
@@ -50,7 +51,6 @@ from failuretwin.connection.fleet.broker import (
     open_broker,
     server_config,
 )
-from failuretwin.connection.fleet.emulated_fleet import EmulatedFleet
 from failuretwin.connection.fleet.messages import ProfileMessage, events_binary, profile_json
 from failuretwin.connection.links.base import Event
 from failuretwin.decision.fleet.partition import EVENTS, PROFILE, Envelope, Partition

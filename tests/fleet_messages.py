@@ -10,7 +10,7 @@ import numpy as np
 
 from failuretwin.app.arms import emulation_with, known_arm
 from failuretwin.app.fleet import resolver
-from failuretwin.connection.fleet.emulated_fleet import EmulatedFleet
+from failuretwin.connection.emulated_arm import EmulatedFleet
 from failuretwin.connection.fleet.messages import (
     ProfileMessage,
     events_binary,

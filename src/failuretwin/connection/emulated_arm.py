@@ -9,7 +9,7 @@ that a stalled bus holds up.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -320,3 +320,43 @@ class EmulatedArm(PacedSource):
             None if weakness is None else weakness[:, 1:],
         )
         return np.concatenate([before, angles[0]])
+
+
+class EmulatedFleet:
+    """Emulated arms that work at random, each with its own clock and seed.
+
+    Args:
+        arms: Name and settings of each arm.
+        begin: Time of the robots' clocks at the start [s].
+        seconds: How long they work [s].
+    """
+
+    def __init__(
+        self, arms: Sequence[tuple[str, Emulation]], begin: float, seconds: float = math.inf
+    ) -> None:
+        shifts = Shifts(break_s=0.0, duration_s=seconds)
+        self._arms = [(name, EmulatedArm(emulation, shifts=shifts)) for name, emulation in arms]
+        self._next: list[Event | None] = [None] * len(arms)
+        self._begin, self._now = begin, 0.0
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the arms."""
+        return [name for name, _ in self._arms]
+
+    def second(self) -> list[tuple[str, list[Event]]] | None:
+        """Return the events of the next second of each arm; None: all have ended."""
+        self._now += 1.0
+        found = [(name, self._until_now(k)) for k, (name, _) in enumerate(self._arms)]
+        ended = all(arm.ended for _, arm in self._arms)
+        return None if ended and not any(events for _, events in found) else found
+
+    def _until_now(self, number: int) -> list[Event]:
+        arm, events = self._arms[number][1], list[Event]()
+        while True:
+            event = self._next[number] or arm.poll(0.0)
+            self._next[number] = event
+            if event is None or event.time > self._now:
+                return events
+            self._next[number] = None
+            events.append(replace(event, time=event.time + self._begin))

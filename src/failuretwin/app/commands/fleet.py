@@ -90,7 +90,7 @@ def bridge(
     replay, `emulated` (with --robots N a fleet), or MODULE:CLASS. Its profile is announced first,
     with the calibration of --calibration.
     """
-    from failuretwin.app.bridging import bridge_emulated, bridge_one
+    from failuretwin.app.fleet import bridge_emulated, bridge_one
 
     to = access.to(url)
     if source == opt.EMULATED:

@@ -21,7 +21,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import urlsplit
 
@@ -175,11 +174,8 @@ class Broker:
             max_bytes=LARGEST_STREAM,
         )
         for wanted in (events, once):
-            await self._make(wanted)
-
-    async def _make(self, wanted: Any) -> None:
-        if await self.messages(wanted.name) is None:
-            await self.stream.add_stream(wanted)
+            if await self.messages(str(wanted.name)) is None:
+                await self.stream.add_stream(wanted)
 
     async def messages(self, stream: str) -> int | None:
         """Return the number of messages in a stream; None: nobody has made it yet.
@@ -237,12 +233,7 @@ class Broker:
         """Return the broker, which is closed at the end of the block."""
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Close the connection."""
         await self.close()
 
