@@ -45,7 +45,6 @@ def serve(port: int, speed: float) -> None:
     """Show many robots and the demo, whose time passes so fast."""
     from failuretwin.app.console.demo import demo_arms
     from failuretwin.app.console.desk import Desk
-    from failuretwin.app.console.server import Listening
     from failuretwin.app.console.server import serve as serve_console
     from failuretwin.app.console.state import WORST_FIRST, Tile
     from failuretwin.app.console.users import Sessions
@@ -73,7 +72,7 @@ def serve(port: int, speed: float) -> None:
     folder = Path(tempfile.mkdtemp())
     arms = demo_arms(open_store(folder / "robots.db", create=True), known, speed)
     desk = Many(known, None, None, arms, False, speed, folder)
-    serve_console(desk, Listening("127.0.0.1", port, Sessions({})))
+    serve_console(desk, "127.0.0.1", port, Sessions({}))
 
 
 def share_of(process: int, seconds: float) -> float:

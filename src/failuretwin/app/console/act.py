@@ -16,7 +16,7 @@ from failuretwin.app.console import draw, texts
 from failuretwin.app.console.checking import CheckRun, beat_watch
 from failuretwin.app.console.desk import Desk, Imported
 from failuretwin.app.console.guard import LARGEST_UPLOAD
-from failuretwin.app.console.layout import Visit, page
+from failuretwin.app.console.layout import Visit
 from failuretwin.app.console.users import MOVE
 from failuretwin.app.reports.check_report import check_lines, closing_lines
 from failuretwin.app.terminal import Table
@@ -46,12 +46,6 @@ REPORTS = 20
 
 
 # Checks.
-
-
-def show_check(visit: Visit, name: str) -> None:
-    """Draw the page of checks."""
-    with page(visit, texts.CHECK):
-        CheckPage(visit, name)
 
 
 class CheckPage:
@@ -256,23 +250,13 @@ class ImportPage:
         draw.text(words(state.step))
         rows = [[one.run, words(one.verdict)] for one in found.diagnoses]
         draw.table((texts.RUN, texts.VERDICT), rows)
-        for line in found.stored or [self._why_not_stored()]:
+        unnamed = texts.NO_NAME if self._stores else texts.NOWHERE_TO_STORE
+        role = texts.NOT_BY_YOU.format(role=visit.session.role)
+        for line in found.stored or [unnamed if visit.confirms else role]:
             draw.text(line)
         number = await draw.worked(_report, visit.desk, found, known)
         if number is not None:
             ui.link(texts.REPORT, f"/report/{number}", new_tab=True)
-
-    def _why_not_stored(self) -> str:
-        """Return why a log is not stored, and how to change that."""
-        if not self._visit.confirms:
-            return texts.NOT_BY_YOU.format(role=self._visit.session.role)
-        return texts.NO_NAME if self._stores else texts.NOWHERE_TO_STORE
-
-
-def show_import(visit: Visit) -> None:
-    """Draw the page for logs."""
-    with page(visit, texts.IMPORT):
-        ImportPage(visit)
 
 
 def placed(folder: Path, name: str, data: bytes) -> Path:

@@ -17,6 +17,7 @@ from failuretwin.app.console import draw, texts
 from failuretwin.app.console.state import SUSPECT
 from failuretwin.core.hypothesis import SURE
 from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.digital_model.kinematics import rotation_to_z
 from failuretwin.digital_model.robot import Robot
 
 THICK = 0.03
@@ -94,7 +95,7 @@ class Arm:
         if length < 1e-6:
             return
         cylinder = ui.scene.cylinder(radius, radius, length, 16).material(colour, opacity)
-        cylinder.move(*(0.5 * end).tolist()).rotate_R(_turned_to(end / length))
+        cylinder.move(*(0.5 * end).tolist()).rotate_R(_along(end))
 
     def pose(self, angles: FloatArray) -> None:
         """Move the joints to angles in the sense of the log, (motor,) [rad or m]."""
@@ -116,14 +117,9 @@ class Arm:
                 self._shade[k] = shade
 
 
-def _turned_to(direction: FloatArray) -> list[list[float]]:
-    """Return the rotation that turns y, the axis of a cylinder, to a unit vector."""
-    y = np.array([0.0, 1.0, 0.0])
-    axis, c = np.cross(y, direction), float(y @ direction)
-    if c < -1.0 + 1e-9:
-        return [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
-    K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    turned: list[list[float]] = (np.eye(3) + K + K @ K / (1.0 + c)).tolist()
+def _along(direction: FloatArray) -> list[list[float]]:
+    """Return a rotation that turns y, the axis of a cylinder, to a direction."""
+    turned: list[list[float]] = rotation_to_z(direction.tolist())[:, [1, 2, 0]].tolist()
     return turned
 
 

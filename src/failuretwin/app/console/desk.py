@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from threading import Event, Thread
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from failuretwin.connection.fleet.broker import Access, open_broker
 from failuretwin.core.errors import FailureTwinError, InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.movements import find_movements
+from failuretwin.core.runs import RunSet
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.records.history import FaultEpisode
@@ -34,9 +34,6 @@ from failuretwin.data_knowledge.records.store import Store
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.robot import Robot, bundled_robots, load_robot
 from failuretwin.inference.diagnoser import BayesDiagnoser
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 LOOK_S = 2.0
 """Time between two looks into the store [s]."""
@@ -50,7 +47,7 @@ STATUS_S = 1.0
 class Imported:
     """A log that was diagnosed: its runs, their diagnoses, and what was stored, a line each."""
 
-    runs: xr.Dataset
+    runs: RunSet
     diagnoses: Sequence[Diagnosis]
     stored: Sequence[str]
 
@@ -265,15 +262,7 @@ class Desk:
         """Return what the store last said of a robot; None: it does not know it."""
         return next((one for one in self._glances if one.robot == name), None)
 
-    def stored_trace(self, name: str, row: int) -> Trace:
-        """Return the motion of a run in the store, and its diagnosis by this version.
-
-        Raises:
-            InputError: If there is no such run, or its log is not here.
-        """
-        return trace_of(*self.stored_log(name, row))
-
-    def stored_log(self, name: str, row: int) -> tuple[xr.Dataset, CalibratedRobot]:
+    def stored_log(self, name: str, row: int) -> tuple[RunSet, CalibratedRobot]:
         """Return a run of a robot in the store as its log has it, and the robot.
 
         Raises:
@@ -333,7 +322,7 @@ def _bundled(kind: str) -> Robot | None:
     return load_robot(kind) if kind in bundled_robots() else None
 
 
-def trace_of(runs: xr.Dataset, known: CalibratedRobot) -> Trace:
+def trace_of(runs: RunSet, known: CalibratedRobot) -> Trace:
     """Return the motion of a single run, and its diagnosis."""
     diagnosis = BayesDiagnoser(known.twin, known.imperfections).diagnose(runs)[0]
     length = float(runs["duration"].values[0])

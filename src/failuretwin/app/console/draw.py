@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Sequence
 from typing import TypeVar
-from urllib.parse import quote
+from urllib.parse import quote, urlencode
 
 from nicegui import events, run, ui
 
@@ -148,8 +148,7 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
 
 def link_to(page_name: str, **query: object) -> str:
     """Return the address of a page of a robot."""
-    told = "&".join(f"{name}={quote(str(value), safe='')}" for name, value in query.items())
-    return f"/{page_name}?{told}"
+    return f"/{page_name}?{urlencode(query, quote_via=quote, safe='')}"
 
 
 async def worked(work: Callable[..., T], *values: object) -> T | None:

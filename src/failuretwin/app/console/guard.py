@@ -10,12 +10,17 @@ import re
 import time
 from collections.abc import Callable, Mapping
 from html import escape
-from http.cookies import SimpleCookie
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import cookie_parser
+from starlette.responses import HTMLResponse
+from starlette.websockets import WebSocketClose
+
 from failuretwin.app.console import texts
 from failuretwin.app.console.users import Session, Sessions
+from failuretwin.app.reports.plots import render_page
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -44,14 +49,6 @@ HEADERS = {
     "referrer-policy": "same-origin",
 }
 
-FORM = """<!doctype html><html lang="en"><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>
-<style>:root{{color-scheme:light dark}}body{{font:1rem/1.5 system-ui,sans-serif;max-width:22rem;
-margin:10vh auto;padding:0 1rem}}label,input,button{{display:block;width:100%;font:inherit;
-box-sizing:border-box}}input,button{{padding:.5rem;margin:.2rem 0 1rem}}
-:focus-visible{{outline:3px solid #ffbf47;box-shadow:0 0 0 5px #16191c}}</style>
-<main><h1>{title}</h1>{body}</main></html>"""
-
 
 class Guard:
     """Refuses what must not reach the pages, and signs people in and out.
@@ -73,33 +70,28 @@ class Guard:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        headers = {
-            key.decode("latin-1"): value.decode("latin-1") for key, value in scope["headers"]
-        }
+        headers, path, is_socket = Headers(scope=scope), scope["path"], scope["type"] == "websocket"
         if self._is_foreign(headers):
-            await _refuse(scope, receive, send, 403, texts.FOREIGN)
+            await _refusal(is_socket, 403, texts.FOREIGN)(scope, receive, send)
             return
-        token = _token(headers)
-        path, session = scope["path"], self._sessions.of(token)
-        if scope["type"] == "http" and path in ("/login", "/logout", "/stop", ALIVE):
+        token = cookie_parser(headers.get("cookie", "")).get(COOKIE)
+        session = self._sessions.of(token)
+        if not is_socket and path in ("/login", "/logout", "/stop", ALIVE):
             body = await _form(receive) if scope["method"] == "POST" else None
-            answer = self._answer(path, body, token, session)
-            await _send(send, *answer)
+            await self._answer(path, body, token, session)(scope, receive, send)
             return
-        if (session is None and not path.startswith("/_nicegui/")) or _is_upload_without(
-            path, session
-        ):
-            if scope["type"] == "websocket":
-                await _refuse(scope, receive, send, 403, texts.EXPIRED)
-            else:
-                await _send(send, 303, "", {"location": "/login"})
+        static = path.startswith("/_nicegui/") and not path.startswith("/_nicegui/client/")
+        if session is None and not static:
+            login = _refusal(True, 403, texts.EXPIRED) if is_socket else _redirect("/login")
+            await login(scope, receive, send)
             return
-        if scope["type"] == "websocket":
+        if is_socket:
             await self._app(scope, _counting(receive), send)
             return
         if int(headers.get("content-length") or 0) > LARGEST_UPLOAD:
             limit = texts.TOO_LARGE.format(limit=LARGEST_UPLOAD // 1024**2)
-            await _refuse(scope, receive, send, 413, texts.REFUSED.format(why=limit))
+            refusal = _refusal(False, 413, texts.REFUSED.format(why=limit))
+            await refusal(scope, receive, send)
             return
         await self._app(scope, _limited(receive), _with_headers(send))
 
@@ -112,62 +104,39 @@ class Guard:
 
     def _answer(
         self, path: str, body: Mapping[str, str] | None, token: str | None, session: Session | None
-    ) -> tuple[int, str, Mapping[str, str]]:
-        """Return status, page and headers of the pages that need no script."""
+    ) -> HTMLResponse:
+        """Return the answer of the pages that need no script."""
         if path == ALIVE:
-            return (401 if session is None else 200), "", {}
+            return _response(401 if session is None else 200)
         if path == "/stop":
             if session is None:
-                return 303, "", {"location": "/login"}
+                return _redirect("/login")
             said = "" if body is None else self._stop(session.name or texts.THIS_COMPUTER)
-            return 200, _stop_page(said), {}
+            return _response(200, _page("/stop", texts.STOP, texts.STOP, "status", said))
         if path == "/logout" and body is not None:
             self._sessions.sign_out(token)
-            return 303, "", {"location": "/login", "set-cookie": f"{COOKIE}=; Max-Age=0; Path=/"}
+            return _redirect("/login", f"{COOKIE}=; Max-Age=0; Path=/")
         if path == "/logout":
-            return 303, "", {"location": "/"}
+            return _redirect("/")
         if body is None:
-            return 200, _login_page(""), {}
+            return _response(200, _login_page(""))
         name, password = body.get("name", ""), body.get("password", "")
         if self._sessions.waits(name):
-            return 429, _login_page(texts.TOO_OFTEN), {}
+            return _response(429, _login_page(texts.TOO_OFTEN))
         made = self._sessions.sign_in(name, password)
         if not made:
-            return 401, _login_page(texts.WRONG), {}
-        cookie = f"{COOKIE}={made}; HttpOnly; SameSite=Strict; Path=/"
-        return 303, "", {"location": "/", "set-cookie": cookie}
-
-
-def _is_upload_without(path: str, session: Session | None) -> bool:
-    """Return whether somebody who is not signed in reaches for more than scripts and styles."""
-    return session is None and path.startswith("/_nicegui/client/")
-
-
-def _token(headers: Mapping[str, str]) -> str | None:
-    try:
-        morsel = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
-    except Exception:  # any cookie that another program has set
-        return None
-    return None if morsel is None else morsel.value
+            return _response(401, _login_page(texts.WRONG))
+        return _redirect("/", f"{COOKIE}={made}; HttpOnly; SameSite=Strict; Path=/")
 
 
 def _login_page(wrong: str) -> str:
-    body = (
-        f'<p role="alert">{escape(wrong)}</p><form method="post" action="/login">'
-        f'<label for="name">{texts.NAME}</label><input id="name" name="name" '
-        f'autocomplete="username" required autofocus><label for="password">{texts.PASSWORD}</label>'
-        '<input id="password" name="password" type="password" autocomplete="current-password" '
-        f"required><button>{texts.SIGN_IN}</button></form>"
-    )
-    return FORM.format(title=texts.LOGIN, body=body)
+    return _page("/login", texts.LOGIN, texts.SIGN_IN, "alert", wrong)
 
 
-def _stop_page(said: str) -> str:
-    body = (
-        f'<p role="status">{escape(said)}</p><form method="post" action="/stop">'
-        f"<button>{texts.STOP}</button></form>"
-    )
-    return FORM.format(title=texts.STOP, body=body)
+def _page(path: str, title: str, press: str, role: str, said: str) -> str:
+    """Return a page that says something, and sends a form to a path when its button is pressed."""
+    values = {"path": path, "title": title, "press": press, "role": role, "said": said}
+    return render_page("form.html.j2", {**values, "texts": texts})
 
 
 async def _form(receive: Receive) -> dict[str, str]:
@@ -185,32 +154,28 @@ async def _form(receive: Receive) -> dict[str, str]:
     return {name: values[0] for name, values in fields.items()}
 
 
-async def _send(send: Send, status: int, page: str, headers: Mapping[str, str]) -> None:
-    sent = {"content-type": "text/html; charset=utf-8", "cache-control": "no-store"}
-    await send({
-        "type": "http.response.start",
-        "status": status,
-        "headers": [
-            (key.encode(), value.encode()) for key, value in {**sent, **HEADERS, **headers}.items()
-        ],
-    })  # fmt: skip
-    await send({"type": "http.response.body", "body": page.encode()})
+def _response(status: int, page: str = "") -> HTMLResponse:
+    return HTMLResponse(page, status, {"cache-control": "no-store", **HEADERS})
 
 
-async def _refuse(scope: Scope, receive: Receive, send: Send, status: int, why: str) -> None:
-    if scope["type"] == "websocket":
-        await receive()
-        await send({"type": "websocket.close", "code": 1008, "reason": why[:100]})
-        return
-    await _send(send, status, escape(why), {})
+def _redirect(to: str, cookie: str = "") -> HTMLResponse:
+    response = _response(303)
+    response.headers["location"] = to
+    if cookie:
+        response.headers["set-cookie"] = cookie
+    return response
+
+
+def _refusal(is_socket: bool, status: int, why: str) -> ASGIApp:
+    return WebSocketClose(1008, why[:100]) if is_socket else _response(status, escape(why))
 
 
 def _with_headers(send: Send) -> Send:
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
-            known = {key.lower() for key, _ in message["headers"]}
-            more = [(k.encode(), v.encode()) for k, v in HEADERS.items() if k.encode() not in known]
-            message = {**message, "headers": [*message["headers"], *more]}
+            given = MutableHeaders(scope=message)
+            for name, value in HEADERS.items():
+                given.setdefault(name, value)
         await send(message)
 
     return sending

@@ -239,7 +239,7 @@ def _compare(visit: Visit, history: History) -> None:
         place.clear()
         dates = [then.value, now.value]
         rows = [
-            [draw.spoken(one.motor), one.name, *_at_dates(visit, one, dates, one.motor)]
+            [draw.spoken(one.motor), one.name, *_at_dates(visit, one, dates)]
             for one in history.drifts
             if one.motor in known.robot.motor_names
         ]
@@ -253,18 +253,18 @@ def _compare(visit: Visit, history: History) -> None:
     show_dates()
 
 
-def _at_dates(visit: Visit, drift: Drift, dates: list[str], motor: str) -> list[str]:
+def _at_dates(visit: Visit, drift: Drift, dates: list[str]) -> list[str]:
     """Return an offset at two dates, and the change between them."""
     known = visit.desk.known.robot
     values = []
     for day in dates:
         before = [k for k, at in enumerate(drift.at) if visit.day(at) <= day]
         values.append(before[-1] if before else 0)
-    angle = drift.unit.startswith("rad") and motor in known.motor_names
+    angle = drift.unit.startswith("rad") and drift.motor in known.motor_names
 
     def word(value: float, directed: bool = drift.name in DIRECTED) -> str:
         if angle:
-            told = visit.difference(value, known, known.motor_names.index(motor), directed)
+            told = visit.difference(value, known, known.motor_names.index(drift.motor), directed)
             return told + drift.unit.removeprefix("rad")
         return f"{value:.4g} {drift.unit}"
 

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 from zoneinfo import ZoneInfo
 
@@ -37,54 +38,8 @@ STAMPS = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
 """Times (UTC) in a text."""
 CHOICES = {"theme": texts.THEMES, "unit": texts.UNIT_NAMES}
 YEAR_S = 31_536_000
-COLOURS = {
-    "alarm": "#b3261e",
-    "suspected": "#8a5a00",
-    "set_up": "#96318f",
-    "undecided": "#6b4fa0",
-    "stale": "#5a6470",
-    "waiting": "#5a6470",
-    "healthy": "#1b6e3c",
-}
-"""Colours of states; white letters on them have a contrast of 5 to 1 or more."""
-STYLE = """
-body { --line: #c9d1d8; --soft: #f3f5f7; --link: #1f5f99; }
-body.body--dark { --line: #4a545d; --soft: #23292e; --link: #8ec5f4; }
-.page { padding: 1rem; max-width: 110rem; margin: 0 auto; width: 100%; }
-h1 { font-size: 1.5rem; line-height: 2rem; font-weight: 600; margin: 0 0 .5rem; }
-h2 { font-size: 1.1rem; line-height: 1.6rem; font-weight: 600; margin: 1rem 0 .25rem; }
-p { margin: .25rem 0; overflow-wrap: anywhere; }
-.page a { color: var(--link); text-decoration: underline; }
-table.plain { border-collapse: collapse; width: 100%; }
-table.plain th, table.plain td { text-align: left; padding: .25rem .6rem; vertical-align: top;
-  border-bottom: 1px solid var(--line); overflow-wrap: break-word; }
-table.plain td:first-child { white-space: nowrap; }
-table.plain .q-btn { margin: .2rem .3rem .2rem 0; }
-@media (max-width: 599px) { table.plain thead { display: none; }
-  table.plain tr { display: block; border-bottom: 1px solid var(--line); padding: .3rem 0; }
-  table.plain td { display: flex; gap: .6rem; border: 0; padding: .1rem 0; }
-  table.plain td:has(.q-btn) { flex-wrap: wrap; gap: 0; }
-  table.plain td:empty { display: none; }
-  table.plain td::before { content: attr(data-label); flex: 0 0 7rem; opacity: .85; } }
-.state { color: #fff; border-radius: .3rem; padding: 0 .5rem; display: inline-block; }
-.choice { font-size: 1rem; border: 1px solid #6b757e; border-radius: .3rem; padding: .3rem .4rem;
-  background: #fff; color: #16191c; }
-.columns { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fit, minmax(20rem, 1fr)); }
-.columns > * { min-width: 0; }
-.full { width: 100%; height: 100%; }
-.scene { height: 24rem; background: #eef1f4; }
-body.body--dark .scene { background: #1d2429; }
-.short { width: 7rem; }
-.chart { height: 14rem; }
-.reason { text-align: left; white-space: normal; }
-a.reason { display: block; }
-.scroll { overflow: auto; max-height: 24rem; }
-.soft { opacity: .85; font-size: .9rem; }
-/* Of important rules those of the first layer win, also over "no-outline" of Quasar. */
-@layer theme { :focus-visible, .kept, .q-field:has(:focus-visible) { outline-offset: 0 !important;
-  outline: 3px solid #ffbf47 !important; box-shadow: 0 0 0 5px #16191c !important; }
-  .q-btn--outline, .q-btn--flat { color: var(--link) !important; } }
-""" + "\n".join(f".state-{name} {{ background: {colour}; }}" for name, colour in COLOURS.items())
+STYLE, FOCUS = (Path(__file__).with_name(name) for name in ("console.css", "focus.js"))
+"""Style of all pages, and the script that keeps the focus of a part that is drawn anew."""
 ZONE_COOKIE = (
     "<script>{const zone='zone='+Intl.DateTimeFormat().resolvedOptions().timeZone;"
     "const known=()=>document.cookie.split('; ').includes(zone);if(!known()){"
@@ -92,30 +47,6 @@ ZONE_COOKIE = (
     "</script>"
 )
 """Tells the server the time zone of the browser; a page that was made without it is made anew."""
-FOCUS = """<script>{
-const all = () => [...document.querySelectorAll(
-  '.page :is(a[href], button, input, select, [tabindex="0"]), header select')];
-const words = (one) =>
-  one.tagName + (one.getAttribute('aria-label') || one.name || one.textContent);
-let last = null, said = sessionStorage.focus, place = 0;
-sessionStorage.removeItem('focus');
-addEventListener('focusin', (e) => {
-  if (!e.target.matches(':focus-visible, .kept')) return;
-  last = e.target; said = words(last); place = all().indexOf(last); });
-addEventListener('focusout', (e) => setTimeout(() => {
-  if (last === e.target && last.isConnected) last = said = null; }));
-addEventListener('beforeunload', () => { if (last) sessionStorage.focus = words(last); });
-new MutationObserver(() => {
-  if (!said || last?.isConnected || document.activeElement !== document.body) return;
-  const found = all(), same = found.find((one) => words(one) === said);
-  const next = same || (last && found[Math.min(place, found.length - 1)]);
-  if (!next) return;
-  next.classList.add('kept');
-  next.addEventListener('blur', () => next.classList.remove('kept'), {once: true});
-  next.focus({preventScroll: true});
-}).observe(document, {childList: true, subtree: true});
-}</script>"""
-"""Keeps the focus, where it is seen, of a part that is drawn anew and of a page loaded again."""
 RELOAD = (
     "<script>{let was=false,n=0;setInterval(async()=>{if(window.socket?.connected)was=true;"
     f"else if(++n%12===0&&(was||n>=120))try{{await fetch('{ALIVE}');location.reload()}}catch{{}}"
@@ -255,7 +186,8 @@ def page(visit: Visit, title: str) -> Iterator[None]:
     ui.colors(primary="#1f5f99", negative="#b3261e", positive="#1b6e3c", warning="#8a5a00")
     ui.dark_mode({"auto": None, "light": False, "dark": True}[visit.theme])
     ui.add_css(STYLE)
-    ui.add_head_html(ZONE_COOKIE + FOCUS + RELOAD)
+    focus = f"<script>{FOCUS.read_text('utf-8')}</script>"
+    ui.add_head_html(ZONE_COOKIE + focus + RELOAD)
     with ui.header().classes("items-center gap-4 py-2").props("elevated"):
         with ui.element("nav").classes("flex gap-4").props('aria-label="Main"'):
             for name, target in (

@@ -71,15 +71,11 @@ def step_lines(
         return [*lines, SET_UP_STEP.format(doubt=tile.set_up)]
     doubted = replace(diagnosis, quality=(*diagnosis.quality, tile.set_up))
     found = robot_state([doubted], robot)
-    for fault in unseen_alarms(alarms, found.state.motors):
-        words = plain_name(Hypothesis.parse(fault))
-        lines.append(joint_names_in(texts.OPEN_ALARM.format(fault=words), robot))
+    for alarm in map(Hypothesis.parse, alarms):
+        if alarm.faults[0].motor not in found.state.motors:  # the last run does not show it
+            told = texts.OPEN_ALARM.format(fault=plain_name(alarm))
+            lines.append(joint_names_in(told, robot))
     return lines if lines and found.step == NOTHING_TO_DO else [*lines, found.step]
-
-
-def unseen_alarms(alarms: Sequence[str], motors: Sequence[str]) -> list[str]:
-    """Return the faults of open episodes whose motor is none of those that a run shows."""
-    return [one for one in alarms if Hypothesis.parse(one).faults[0].motor not in motors]
 
 
 def motor_table(robot: Robot, diagnosis: Diagnosis, alarms: Sequence[str] | None = None) -> None:

@@ -9,6 +9,7 @@ from failuretwin.app.console import draw, parts, texts
 from failuretwin.app.console import state as shown
 from failuretwin.app.console.arm import ArmScene
 from failuretwin.app.console.charts import Charts
+from failuretwin.app.console.desk import trace_of
 from failuretwin.app.console.layout import Visit, page
 from failuretwin.app.console.state import Trace
 from failuretwin.core.hypothesis import Diagnosis
@@ -33,7 +34,7 @@ async def show(visit: Visit, name: str, run: int, at: float) -> None:
             return
         trace = live.trace() if live is not None and run == 0 else None
         if trace is None:
-            trace = await draw.worked(desk.stored_trace, name, run)
+            trace = await draw.worked(lambda: trace_of(*desk.stored_log(name, run)))
         if trace is None or not len(trace.time):
             draw.alert(texts.NO_LOG)
             return
@@ -75,11 +76,8 @@ class Replay:
         self._move()
 
     def _button(self, reason: str, at: float) -> None:
-        button = draw.button(reason, lambda: self._go_to(at))
+        button = draw.button(reason, lambda: self._slider.go_to(at))
         button.props("flat align=left").classes("reason")
-
-    def _go_to(self, at: float) -> None:
-        self._slider.go_to(at)
 
     def _toggle(self) -> None:
         self._timer.active = not self._timer.active

@@ -15,7 +15,7 @@ from failuretwin.app.console.arm import ArmScene
 from failuretwin.app.console.charts import Charts
 from failuretwin.app.console.desk import LOOK_S, has_log
 from failuretwin.app.console.layout import Visit, page
-from failuretwin.app.console.live import STATES, LiveRobot
+from failuretwin.app.console.live import LiveRobot
 from failuretwin.app.console.state import LiveView, Tile
 from failuretwin.connection.links.base import OK
 from failuretwin.core.errors import InputError
@@ -315,7 +315,7 @@ class LivePage:
             rows = [
                 [
                     draw.spoken(one.name),
-                    texts.STATES[STATES[one.state]],
+                    texts.STATES[shown.STATES[one.state]],
                     percent(float(one.values.get("probability", 0))),
                     "" if one.state == OK else one.values.get("mode", "").replace("_", " "),
                 ]

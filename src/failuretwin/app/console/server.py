@@ -7,7 +7,6 @@ import logging
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from nicegui import app, core, ui
@@ -17,7 +16,7 @@ from starlette.responses import HTMLResponse
 from failuretwin.app.console import act, history, replay, robot, texts, wall
 from failuretwin.app.console.desk import Desk
 from failuretwin.app.console.guard import COOKIE, Guard
-from failuretwin.app.console.layout import Visit
+from failuretwin.app.console.layout import Visit, page
 from failuretwin.app.console.users import Session, Sessions
 from failuretwin.app.terminal import tell
 
@@ -33,21 +32,6 @@ LARGEST_MESSAGE = 1024 * 1024
 """Largest message of a page [bytes]."""
 
 
-@dataclass(frozen=True)
-class Listening:
-    """Where the server listens, and who may come in.
-
-    Attributes:
-        host: Address.
-        port: Port.
-        sessions: Sessions.
-    """
-
-    host: str
-    port: int
-    sessions: Sessions
-
-
 class _WithoutLeavers(logging.Filter):
     """Leaves out browsers that went on before their answer, which Starlette logs as an error."""
 
@@ -56,16 +40,15 @@ class _WithoutLeavers(logging.Filter):
         return str(error) != "No response returned."
 
 
-def serve(desk: Desk, listening: Listening) -> None:
-    """Show the console until it is stopped."""
-    sessions = listening.sessions
+def serve(desk: Desk, host: str, port: int, sessions: Sessions) -> None:
+    """Show the console at an address until it is stopped."""
 
     def visit_of(request: Request) -> Visit:
         session = sessions.of(request.cookies.get(COOKIE))
         return Visit.of(desk, session or Session("", "see", ended=True), request)
 
     _add_pages(desk, visit_of)
-    hosts = LOCAL if listening.host in LOCAL else frozenset[str]()
+    hosts = LOCAL if host in LOCAL else frozenset[str]()
 
     def stop(name: str) -> str:
         if desk.check is None or not desk.check.running:
@@ -85,11 +68,11 @@ def serve(desk: Desk, listening: Listening) -> None:
     app.on_startup(desk.start)
     app.on_shutdown(desk.stop)
     logging.getLogger("uvicorn.error").addFilter(_WithoutLeavers())
-    tell(f"console: http://{listening.host}:{listening.port} (stop with Ctrl-C)")
+    tell(f"console: http://{host}:{port} (stop with Ctrl-C)")
     os.environ.setdefault("NICEGUI_STORAGE_PATH", str(desk.folder / "nicegui"))
     ui.run(
-        host=listening.host,
-        port=listening.port,
+        host=host,
+        port=port,
         title=texts.TITLE,
         favicon=Path(__file__).with_name("icon.svg"),
         language="en-GB",
@@ -124,11 +107,13 @@ def _add_pages(desk: Desk, visit_of: Callable[[Request], Visit]) -> None:
 
     @ui.page("/check")
     def check_page(request: Request, name: str = "") -> None:
-        act.show_check(visit_of(request), name)
+        with page(visit := visit_of(request), texts.CHECK):
+            act.CheckPage(visit, name)
 
     @ui.page("/import")
     def import_page(request: Request) -> None:
-        act.show_import(visit_of(request))
+        with page(visit := visit_of(request), texts.IMPORT):
+            act.ImportPage(visit)
 
     @app.get("/technician")
     def technician_page(name: str = "", run: int = 0) -> HTMLResponse:

@@ -12,7 +12,7 @@ import numpy as np
 from failuretwin.app.console import texts
 from failuretwin.connection.links.statuses import Status
 from failuretwin.core.foreign import printable
-from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, Alarm, Diagnosis, Hypothesis
+from failuretwin.core.hypothesis import CLEAR, FAULTY_STATE, Alarm, Diagnosis, Hypothesis
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.records import CHECK_DAYS
 from failuretwin.data_knowledge.records.overview import RobotGlance
@@ -90,6 +90,11 @@ class Tile:
         said = self.said if set_up in self.said else told
         return replace(self, state=state, said=said, set_up=set_up)
 
+    @property
+    def silent(self) -> Tile:
+        """It as a robot that is stale: what it said is its last word."""
+        return replace(self, state=STALE, said=texts.LAST_WORD.format(said=self.said))
+
     def record(self) -> dict[str, Any]:
         """Return it for the page."""
         return {
@@ -127,7 +132,6 @@ class LiveView:
 
     Attributes:
         tile: It on the wall.
-        stream_time: Time of the stream [s].
         sample: The last reading; None: none yet.
         statuses: Status of the arm, then of each motor.
         diagnosis: The diagnosis; None: none yet.
@@ -136,7 +140,6 @@ class LiveView:
     """
 
     tile: Tile
-    stream_time: float
     sample: Sample | None
     statuses: Sequence[Status]
     diagnosis: Diagnosis | None
@@ -224,25 +227,18 @@ def stored_tile(glance: RobotGlance, now: datetime) -> Tile:
     mode = modes_of(list(glance.faults))
     if glance.at is None:
         return Tile(glance.robot, glance.kind, WAITING, mode, texts.NEVER, None)
-    silent = now - glance.at > timedelta(days=CHECK_DAYS)
-    state = ALARM if glance.faults else _STATES.get(glance.state, UNDECIDED)
-    if silent:
-        state, said = STALE, texts.LAST_WORD.format(said=said)
+    state = ALARM if glance.faults else STATES.get(glance.state, UNDECIDED)
     tile = Tile(glance.robot, glance.kind, state, mode, said, glance.at)
-    return tile.doubted(set_up_doubt(glance.remarks))
+    silent = now - glance.at > timedelta(days=CHECK_DAYS)
+    return (tile.silent if silent else tile).doubted(set_up_doubt(glance.remarks))
 
 
-_STATES = {HEALTHY_STATE: HEALTHY, FAULTY_STATE: ALARM}
-
-FLEET_STATES = {
-    "alarm": ALARM,
-    "suspected": SUSPECTED,
-    "undecided": UNDECIDED,
-    "STALE": STALE,
-    "stale": STALE,
-    "waiting": WAITING,
-    "clear": HEALTHY,
+STATES = {
+    **{state: state for state in WORST_FIRST},
+    **{state.upper(): state for state in WORST_FIRST},
+    **{"OK": HEALTHY, CLEAR: HEALTHY, FAULTY_STATE: ALARM},
 }
+"""State of a robot by the words of the store, of the fleet and of live statuses."""
 REPORT_S = 30.0
 """Age of a report of a worker from which its robots are stale [s]."""
 
@@ -259,14 +255,12 @@ def fleet_tiles(status: Mapping[str, Any], kinds: Mapping[str, str], now_s: floa
     for part in status["partitions"].values():
         late = now_s - part["at"] > REPORT_S
         for name, one in part["robots"].items():
-            state = STALE if late else FLEET_STATES.get(one["state"], UNDECIDED)
-            cause = str(one["cause"])
-            said = cause or texts.STATES[FLEET_STATES.get(one["state"], UNDECIDED)]
+            state, cause = STATES.get(one["state"], UNDECIDED), str(one["cause"])
+            said = cause or texts.STATES[state]
             mode = modes_of([cause]) if ":" in cause and " " not in cause else ""
-            if state == STALE:
-                said = texts.LAST_WORD.format(said=said)
             heard = datetime.fromtimestamp(one["heard"], UTC) if one["heard"] > 0 else None
             tile = Tile(name, kinds.get(name, ""), state, mode, said, heard)
+            tile = tile.silent if late or state == STALE else tile
             tiles.append(tile.doubted(set_up_doubt([cause])))
     return tiles
 

@@ -8,27 +8,11 @@ from typing import Any
 from nicegui import ui
 
 from failuretwin.app.console import draw, texts
-from failuretwin.app.console.layout import COLOURS, Visit, page
+from failuretwin.app.console.layout import Visit, page
 from failuretwin.app.console.state import Tile
 
 PERIOD_S = 1.0
 """Time between two updates [s]."""
-STYLE = """
-.wall-filters { display: flex; flex-wrap: wrap; gap: .5rem 1rem; align-items: end;
-  margin: .5rem 0; }
-.wall-filters label { display: flex; flex-direction: column; font-size: .85rem; }
-.wall-filters input, .wall-filters select { font-size: 1rem; border: 1px solid #6b757e;
-  border-radius: .3rem; padding: .2rem .4rem; background: #fff; color: #16191c; min-height: 2rem; }
-.wall { list-style: none; margin: 0; padding: 0; display: grid; gap: .5rem;
-  grid-template-columns: repeat(auto-fill, minmax(min(17rem, 100%), 1fr)); }
-.wall li { content-visibility: auto; contain-intrinsic-size: auto 7rem; }
-.wall a { display: flex; flex-direction: column; gap: .15rem; height: 100%; padding: .5rem .7rem;
-  border: 1px solid var(--line); border-left-width: .5rem; border-radius: .4rem; color: inherit;
-  background: var(--soft); text-decoration: none; overflow-wrap: anywhere; }
-.wall a .badges { display: flex; flex-wrap: wrap; gap: .3rem; }
-.wall .said { font-size: .9rem; line-height: 1.4; display: -webkit-box; overflow: hidden;
-  -webkit-box-orient: vertical; -webkit-line-clamp: 3; }
-""" + "\n".join(f".wall .edge-{name} {{ border-left-color: {c}; }}" for name, c in COLOURS.items())
 
 
 class Wall(ui.element, component="wall.js"):
@@ -56,7 +40,6 @@ class Wall(ui.element, component="wall.js"):
 def show(visit: Visit) -> None:
     """Draw the page."""
     with page(visit, texts.WALL):
-        ui.add_css(STYLE)
         trouble = draw.alert("")
         note = draw.text("").props('role="status"')
         wall = Wall()
