@@ -179,14 +179,13 @@ class SelfCalibratingDiagnoser:
         found = folder_posterior(likelihood, bayes.hypothesis_set, bayes.priors, advance)
         names, truth = [str(name) for name in runs["run"].values], truths_of(runs)
         judged = [(one, at) for one in found.posteriors for at in range(len(one.log_posterior))]
-        told = [
-            posterior.to_diagnosis(at, names[run], seen.quality[run], truth[run])
-            for run, (posterior, at) in enumerate(judged)
-        ]
-        way = evidence.on_the_way
         diagnoses = [
-            replace(one, protocol="P1", method=_method(robot, bool(way[run])))
-            for run, one in enumerate(told)
+            replace(
+                posterior.to_diagnosis(at, names[run], seen.quality[run], truth[run]),
+                protocol="P1",
+                method=_method(robot, bool(evidence.on_the_way[run])),
+            )
+            for run, (posterior, at) in enumerate(judged)
         ]
         learned = as_calibration(found, believed, robot, runs)
         prior = np.exp(log_prior(bayes.hypothesis_set, bayes.priors))

@@ -66,7 +66,9 @@ def fit_student(residual: Residual, begin: FloatArray, dims: int) -> StudentFit:
         before, sigma = sigma, _sigma(residual(x), sigma, dims)
         if abs(sigma - before) < SETTLED * sigma:
             break
-    r, J = residual(x), _jacobian(residual, x)
+    r, steps = residual(x), 1e-4 * np.eye(len(x))
+    slopes = [(residual(x + step) - residual(x - step)).ravel() / 2e-4 for step in steps]
+    J = np.stack(slopes, axis=1)
     freedom = float(dims * len(r))
     size = np.linalg.svd(J / sigma, compute_uv=False) ** 2
     lost = min(float(np.sum(size / (1.0 + size))), 0.9 * freedom)  # told by rows, not by the prior
@@ -108,10 +110,3 @@ def _effective(r: FloatArray, sigma: float, dims: int) -> float:
     slope = float(np.mean(weight * (1.0 - 2.0 * d / (dims * (DOF + d)))))
     middle = float(np.sqrt(np.mean(weight**2 * square) / dims))
     return max(middle / slope, LEAST_SIGMA)
-
-
-def _jacobian(residual: Residual, x: FloatArray) -> FloatArray:
-    """Return derivatives of the residuals by central differences, (n row, unknown)."""
-    steps = 1e-4 * np.eye(len(x))
-    columns = [(residual(x + step) - residual(x - step)).ravel() / 2e-4 for step in steps]
-    return np.stack(columns, axis=1)

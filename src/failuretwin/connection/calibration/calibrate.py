@@ -50,6 +50,7 @@ from failuretwin.connection.calibration.timing_fit import (
     punctual,
     transients,
 )
+from failuretwin.connection.population import stated_variation
 from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import RunSet, check_motors, truth_of
@@ -190,18 +191,13 @@ def _variation(part: SettlingFit, losses: Sequence[LossRates], robot: Robot) -> 
     Logs do not tell what will change until they are used: what arms of the class do is added.
     """
     deviation = part.fit.deviation[:-1].reshape(4, -1)
-    bias, compliance, friction, log_scatter = deviation
-    bias = np.hypot(bias, class_of(robot).session_rad)
-    size = np.abs(part.fit.mode[:-1].reshape(4, -1)[1])
-    share = np.divide(compliance, size, out=np.zeros_like(size), where=size > compliance)
+    bias = np.hypot(deviation[0], class_of(robot).session_rad)
     hits = sum(loss.punctual.hits + loss.late.hits for loss in losses)
-    return Variation(
-        bias=tuple(bias.tolist()),
-        compliance=tuple(share.tolist()),
-        friction=tuple(friction.tolist()),
-        scatter=tuple(log_scatter.tolist()),
-        rates=float(1.0 / np.sqrt(hits + 0.5)) if hits else 0.0,
-    )
+    rates = float(1.0 / np.sqrt(hits + 0.5)) if hits else 0.0
+    others = Variation(scatter=tuple(deviation[3].tolist()), rates=rates)
+    found = stated_variation(np.stack([bias, *deviation[1:3]]), part.settling, others)
+    known = tuple(share if share < 1.0 else 0.0 for share in found.compliance)
+    return replace(found, compliance=known)
 
 
 def _glitch_parameters(glitches: Sequence[Rate] | None, robot: Robot) -> list[Parameter]:

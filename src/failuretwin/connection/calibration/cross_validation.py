@@ -148,13 +148,6 @@ class Predictions:
     unseen: bool
 
 
-def trusted_runs(found: Calibration, runs: RunSet) -> RunSet:
-    """Return the runs that were not left out as a whole."""
-    out = {entry.run for entry in found.left_out if entry.movement == 0}
-    kept = [i for i, run in enumerate(runs["run"].values) if str(run) not in out]
-    return runs.isel(run=kept)
-
-
 def settling_of(found: Calibration, robot: Robot) -> Settling:
     """Return where the motors settle by a calibration."""
     return found.imperfections.settling or Settling.ideal(len(robot.motors))
@@ -166,24 +159,19 @@ def predict(found: Calibration, runs: RunSet, robot: Robot) -> Predictions:
     Where none were, each session is expected by a fit to the others; with one session alone, by
     the calibration itself.
     """
-    seen, settling = _observed(found, runs, robot), settling_of(found, robot)
+    out = {entry.run for entry in found.left_out if entry.movement == 0}
+    trusted = [i for i, run in enumerate(runs["run"].values) if str(run) not in out]
+    settling = settling_of(found, robot)
+    seen = observe(runs.isel(run=trusted), robot)
+    seen = seen.of(uncalibrated(robot, seen.of_motors, payload=settling.payload))
     learned = np.array([name in found.sessions for name in seen.sessions])[seen.session]
-    pose = None
-    if learned.all():
-        pose = _expected_by_others(seen, robot)
-    else:
-        seen = seen[np.flatnonzero(~learned)]
+    pose = _expected_by_others(seen, robot) if learned.all() else None
     unseen = pose is not None or not learned.all()
+    if not learned.all():
+        seen = seen[np.flatnonzero(~learned)]
     if pose is None:
         pose = expected_pose(seen, robot, settling)
     return _predictions(seen, found, robot, pose, unseen)
-
-
-def _observed(found: Calibration, runs: RunSet, robot: Robot) -> Observations:
-    """Return the movements of trusted runs, of a robot with the payload of the calibration."""
-    seen = observe(trusted_runs(found, runs), robot)
-    payload = settling_of(found, robot).payload
-    return seen.of(uncalibrated(robot, seen.of_motors, payload=payload))
 
 
 def _expected_by_others(seen: Observations, robot: Robot) -> FloatArray | None:

@@ -115,7 +115,8 @@ class SettlingFit:
     @cached_property
     def fit(self) -> SettlingPosterior:
         """Where motors settle, with covariance."""
-        habits, settling = _habits(self.together), self.settling
+        habits = _believed(self.together).plus(self.together.told)
+        settling, motors = self.settling, len(self.together.learned.scatter)
         (_,), (covariance,) = self.together.belief.moments
         unit, own = self.together.unit, self.together.layout.offsets
         offsets = (covariance * np.outer(unit, unit))[own, own]
@@ -127,7 +128,7 @@ class SettlingFit:
         return SettlingPosterior(
             np.concatenate([*told, [np.log(settling.tail_dof)]]),
             whole,
-            np.concatenate([unit[own], _spreads(len(settling.scatter))]),
+            np.array([*unit[own], *[SCATTER_PRIOR_SPREAD] * motors, DOF_PRIOR_SPREAD]),
         )
 
     @cached_property
@@ -227,14 +228,6 @@ def fitted_to(observations: Observations, together: RunsTogether) -> SettlingFit
 def _believed(together: RunsTogether) -> Habits:
     given = together.given.model
     return Habits.believed(given, SCATTER_PRIOR_SPREAD, DOF_PRIOR_SPREAD)
-
-
-def _spreads(motors: int) -> FloatArray:
-    return np.array([*[SCATTER_PRIOR_SPREAD] * motors, DOF_PRIOR_SPREAD])
-
-
-def _habits(together: RunsTogether) -> Habits:
-    return _believed(together).plus(together.told)
 
 
 def _moved(together: RunsTogether, place: FloatArray, settling: Settling) -> float:

@@ -98,7 +98,9 @@ def register(poses: Poses, robot: Robot, source: str = "", date: str = "") -> Re
         InputError: As `fit_registration`.
     """
     arm = Arm(robot)
-    _refuse_units(poses, robot)
+    setup = gross_unit(DigitalTwin(robot), poses.target, poses.point)
+    if setup is not None:
+        raise InputError(f"{setup.told} in the column map.")
     best, others = search(arm, poses)
     _refuse_misfit(best, poses, robot)
     whole = _with_details(arm, best, poses)
@@ -171,14 +173,8 @@ def _middle_mm(error: FloatArray) -> float:
 # Set-ups that no frame can mend.
 
 
-def _refuse_units(poses: Poses, robot: Robot) -> None:
-    setup = gross_unit(DigitalTwin(robot), poses.target, poses.point)
-    if setup is not None:
-        raise InputError(f"{setup.told} in the column map.")
-
-
 def _refuse_misfit(found: Posterior, poses: Poses, robot: Robot) -> None:
-    away = float(np.median(np.linalg.norm(_error(found, poses), axis=1)))
+    away = 1e-3 * _middle_mm(_error(found, poses))
     if away <= NEAR * extent(poses.point):
         return
     setup = wrong_setup(DigitalTwin(robot), poses.target, poses.point)
