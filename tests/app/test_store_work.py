@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 import failuretwin as ft
+from failuretwin.app.keepers import begin_watch
 from failuretwin.app.remembering import RobotRecord
 from failuretwin.app.shadow import Change, Snapshot
-from failuretwin.app.watch_keeper import begin_watch
 from failuretwin.connection.links.base import OK, Answer
 from failuretwin.connection.tracked_diagnosis import read_rows
 from failuretwin.core.errors import InputError
@@ -211,7 +211,7 @@ def keeper_of(file, armpi):
 def test_a_store_that_is_locked_delays_what_is_stored_and_loses_nothing(file, armpi, monkeypatch):
     store = ft.open_store(file, create=True)
     monkeypatch.setattr("failuretwin.data_knowledge.records.database.PATIENCE_S", 0.05)
-    monkeypatch.setattr("failuretwin.app.watch_keeper.RETRY_S", 0.0)
+    monkeypatch.setattr("failuretwin.app.keepers.RETRY_S", 0.0)
     keeper = keeper_of(file, armpi)
     with closing(sqlite3.connect(file, isolation_level=None)) as holder:
         holder.execute("BEGIN IMMEDIATE")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -14,9 +15,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from failuretwin.app.commands.options import EMULATED, ArmOptions, LiveOptions
+from failuretwin.app.terminal import tell, until_interrupted
 from failuretwin.connection.links import NETWORKS
-from failuretwin.connection.links.base import Commander, Sink, Source, source_from_text
-from failuretwin.connection.links.replay import Pace
+from failuretwin.connection.links.base import (
+    Commander,
+    CommandSent,
+    Order,
+    Reading,
+    Sink,
+    Source,
+    source_from_text,
+)
+from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace
 from failuretwin.connection.links.ros_link import (
     RosCommander,
     RosSink,
@@ -24,7 +34,12 @@ from failuretwin.connection.links.ros_link import (
     is_network,
     open_transport,
 )
-from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosTopics, load_topics
+from failuretwin.connection.links.ros_messages import (
+    DiagnosticsWriter,
+    RosTopics,
+    RosWriter,
+    load_topics,
+)
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
@@ -37,7 +52,7 @@ from failuretwin.digital_model.calibrated_robot import (
     load_calibration,
 )
 from failuretwin.digital_model.robot import Robot
-from failuretwin.failure_behavior.injection import ScheduledFault
+from failuretwin.failure_behavior.injection import ScheduledFault, state_at
 from failuretwin.failure_behavior.mode import FaultMode, SizedMode
 from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
 from failuretwin.failure_behavior.registry import MODES
@@ -194,6 +209,11 @@ def connect(
     return stack.enter_context(source), []
 
 
+def is_log(source: str) -> bool:
+    """Return whether a SOURCE on the command line is a log to replay."""
+    return source != EMULATED and Path(source).exists()
+
+
 def _emulated(robot: Robot, live: LiveOptions, seed: int, takes_orders: bool) -> Source:
     from failuretwin.connection.emulated_arm import EmulatedArm, Shifts
 
@@ -208,6 +228,92 @@ def _log(text: str, robot: Robot, topics: RosTopics, pace: Pace) -> Source:
 
     recorded = BagTopics(topics.command, topics.tool or None, topics.position or None)
     return replay(Path(text), robot, pace, None if topics == RosTopics() else recorded)
+
+
+# Arms that `emulate` plays on a network or into a recording: at random, or as ordered.
+
+FILE_S, AFTER_S = 60.0, 20.0
+"""Default length of a recording, and its minimum length after the last start or end of a fault
+[s]."""
+POLL_S = 0.01
+"""Longest wait for the arm before commands are read again [s]."""
+
+
+def play_orders(target: str, emulation: Emulation, live: LiveOptions) -> None:
+    """Publish readings and carry out the commands of a network, until interrupted."""
+    if not is_network(target):
+        raise InputError(f"--obey needs a network to obey, but --to is {target!r}.")
+    if live.speed != 1.0:
+        raise InputError(
+            f"--obey takes commands that are stamped by clocks of speed 1, but --speed is "
+            f"{live.speed:g}: stamps would not fit the movements. Leave out --speed."
+        )
+    from failuretwin.connection.emulated_arm import EmulatedArm
+
+    topics, arm = load_topics(live.topics), EmulatedArm(emulation, Pace())
+    writer = RosWriter(emulation.robot, topics)
+    with open_transport(target) as transport, until_interrupted():
+        sink = RosSink(writer, transport)
+        orders = RosSource(emulation.robot, topics, transport)
+        tell("an emulated robot obeys; stop with Ctrl-C")
+        now, zero = 0.0, time.time()
+        while now < (live.seconds or math.inf):
+            event = arm.poll(POLL_S)
+            if isinstance(event, Reading):
+                now = event.time
+                sink.put(replace(event, time=event.time + zero))
+            while (heard := orders.poll(0.0)) is not None:
+                if isinstance(heard, CommandSent):
+                    arm.send(Order(heard.target, heard.duration))
+
+
+def play(target: str, emulation: Emulation, live: LiveOptions) -> None:
+    """Publish or record a robot that moves at random."""
+    from failuretwin.connection.emulated_arm import EmulatedArm, Shifts
+
+    zero, on_network = time.time(), is_network(target)
+    if not on_network and Path(target).suffix != ".mcap":
+        places = ", ".join(NETWORKS)
+        raise InputError(f"--to is {target!r}, expected {places} or a file that ends in .mcap.")
+    length = live.seconds or (math.inf if on_network else _file_length(emulation.schedule))
+    pace = Pace(live.speed if on_network else AS_FAST_AS_POSSIBLE)
+    source = EmulatedArm(emulation, pace, Shifts(break_s=0.0, duration_s=length))
+    state = trouble = ""
+    with ExitStack() as stack, until_interrupted():
+        sink = _sink(target, emulation, live, stack)
+        stack.enter_context(source)
+        while not source.ended:
+            event = source.poll(1.0)
+            if event is None:
+                continue
+            sink.put(replace(event, time=event.time + zero))
+            if sink.trouble != trouble:
+                trouble = sink.trouble
+                tell(trouble or "going on")
+            now = state_at(emulation.schedule, event.time, emulation.robot.motor_names)
+            if now != state:
+                state = now
+                tell(f"{event.time:8.1f} s  {state}")
+    if sink.trouble:
+        raise InputError(sink.trouble)
+    if source.ended and not on_network:
+        tell(f"{length:g} s written to {target}")
+
+
+def _sink(target: str, emulation: Emulation, live: LiveOptions, stack: ExitStack) -> Sink:
+    """Return the network or recording that an emulated robot publishes to; the stack closes it."""
+    if is_network(target):
+        writer = RosWriter(emulation.robot, load_topics(live.topics))
+        return RosSink(writer, stack.enter_context(open_transport(target)))
+    from failuretwin.connection.links.recorder import Recorder
+
+    return stack.enter_context(Recorder(Path(target), emulation.robot))
+
+
+def _file_length(schedule: Sequence[ScheduledFault]) -> float:
+    """Return the length of a recording that shows all scheduled faults [s]."""
+    times = [t for one in schedule for t in (one.start_s, one.end_s) if math.isfinite(t)]
+    return max([FILE_S, *(t + AFTER_S for t in times)])
 
 
 # Motors and numbers in option texts.
@@ -239,7 +345,7 @@ def spared_of(
     texts: Sequence[str],
     rows: Sequence[Mapping[str, Any]],
     model: HealthyModel,
-    tell: Callable[[str], None],
+    say: Callable[[str], None],
 ) -> FloatArray | None:
     """Return the weights of motors to spare, (motor,); None if no motor is spared.
 
@@ -251,10 +357,10 @@ def spared_of(
     if rows:
         weight = wear_weights(rows, model)
         worn = [f"{names[k]} {weight[k]:.0%}" for k in np.flatnonzero(weight)]
-        tell(f"worn, of what is allowed: {', '.join(worn) or 'no motor beyond doubt'}")
+        say(f"worn, of what is allowed: {', '.join(worn) or 'no motor beyond doubt'}")
         alarm = stopped_learning(rows)
         if alarm:
-            tell(f"that is from before the history stopped to learn: {alarm}")
+            say(f"that is from before the history stopped to learn: {alarm}")
     for text in texts:
         name, _, share = text.partition("=")
         Hypothesis.parse(f"{name}:stuck", names)

@@ -16,7 +16,8 @@ from failuretwin.decision.acting.task import TargetResult
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 
 if TYPE_CHECKING:
-    from failuretwin.app.remembering import RobotRecord, WorkKeeper
+    from failuretwin.app.keepers import WorkKeeper
+    from failuretwin.app.remembering import RobotRecord
 
 
 @dataclass(frozen=True)
@@ -42,14 +43,16 @@ class Diary:
 
 
 @contextmanager
-def noting(
-    stored: RobotRecord | None, command: str, known: CalibratedRobot, method: str
-) -> Iterator[Diary]:
-    """Give a diary, which is stored as a session as the work goes on.
+def noting(stored: RobotRecord | None, known: CalibratedRobot, method: str) -> Iterator[Diary]:
+    """Give a diary, which is stored as a session of `act` as the work goes on.
 
     Where an error or Ctrl-C ends the work, it holds the reason.
     """
-    keeper = None if stored is None else stored.work_keeper(command, known, method)
+    keeper = None
+    if stored is not None:
+        from failuretwin.app.keepers import WorkKeeper  # needs the extra `store`
+
+        keeper = WorkKeeper(stored, stored.basis("act", method, known))
     diary = Diary(keeper)
     try:
         yield diary

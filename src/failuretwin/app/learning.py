@@ -36,7 +36,7 @@ from failuretwin.inference.together.folder_posterior import PASSES
 if TYPE_CHECKING:
     import xarray as xr
 
-    from failuretwin.app.life_keeper import LifeKeeper
+    from failuretwin.app.keepers import LifeKeeper
     from failuretwin.app.remembering import RobotRecord
 
 SURE = 0.9
@@ -107,18 +107,22 @@ def found_in(
     runs: xr.Dataset,
     bayes: BayesDiagnoser,
     diagnoser: Diagnoser,
-    tracking: Tracking | None,
-    start: Start | None,
+    learns: Tracking | Start | None,
+    sensed: Sequence[str],
 ) -> Findings:
-    """Return diagnoses of runs.
+    """Return diagnoses of runs by what sensors saw.
 
-    `tracking` learns run by run, `start` begins to learn from all runs at once; None: neither.
+    A `Tracking` learns run by run, a `Start` begins to learn from all runs at once.
+
+    Raises:
+        InputError: If the robot cannot be learned from what was seen.
     """
-    if tracking is not None:
-        return tracking.diagnose(runs)
-    if start is not None:
-        return self_calibrated(runs, bayes, start)
-    return Findings(diagnoser.diagnose(runs), bayes)
+    if learns is None:
+        return Findings(diagnoser.diagnose(runs), bayes)
+    check_learning_from(sensed)
+    if isinstance(learns, Tracking):
+        return learns.diagnose(runs)
+    return self_calibrated(runs, bayes, learns)
 
 
 def self_calibrated(runs: xr.Dataset, bayes: BayesDiagnoser, start: Start) -> Findings:
@@ -152,12 +156,12 @@ class Tracking:
     def __init__(self, bayes: BayesDiagnoser, start: Start) -> None:
         self._bayes, self._out = bayes, start.out
         if start.out is not None:
-            _check_out(start.out, start, bayes.twin.robot)
+            _check_out(start.out, start.cold, bayes.twin.robot)
         begun = begin(bayes, start.cold)
         self._keeper: LifeKeeper | None = None
         beside = start.out if start.cold else start.calibration
         if start.stored is not None:
-            from failuretwin.app.life_keeper import LifeKeeper  # needs the extra `store`
+            from failuretwin.app.keepers import LifeKeeper  # needs the extra `store`
 
             self._keeper = LifeKeeper(start.stored, "diagnose")
             self._history = self._keeper.history(begun, start.cold)
@@ -182,9 +186,9 @@ class Tracking:
             keep_history(found.history, found.life, found.rows)
 
 
-def _check_out(out: Path, start: Start, robot: Robot) -> None:
+def _check_out(out: Path, cold: bool, robot: Robot) -> None:
     """Raise InputError unless `out` is the one place for what is learned."""
-    if not start.cold:
+    if not cold:
         raise InputError(
             "--track keeps what it learns beside the calibration that it began with. Leave out "
             "--out, or --calibration to begin with the arm class."

@@ -38,7 +38,7 @@ from failuretwin.inference.calibration_fit import MISFIT
 from failuretwin.inference.explanation import percent
 
 if TYPE_CHECKING:
-    from failuretwin.app.watch_keeper import WatchKeeper
+    from failuretwin.app.keepers import WatchKeeper
 
 REFRESH_S = 0.25
 """Time between two drawings [s]."""

@@ -11,7 +11,7 @@ from failuretwin.app.inputs import with_map
 from failuretwin.app.learning import Start, check_learning_from, self_calibrated
 from failuretwin.app.reports.reports import score_parts
 from failuretwin.app.terminal import Part, figures_table, progress_bar, tell
-from failuretwin.core.errors import counted
+from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, OPEN_STATE
 from failuretwin.data_knowledge.run_pieces import PIECE, RunPieces
 from failuretwin.data_knowledge.workers import Workforce
@@ -37,13 +37,30 @@ def diagnose_many(
     bayes: BayesDiagnoser,
     folder: Path,
     workforce: Workforce,
-    start: Start | None = None,
+    start: Start | None,
+    stored: RobotRecord | None,
+    recorded: datetime | None,
 ) -> list[Part]:
     """Diagnose runs of any number into a folder of parquet files, and return a summary.
 
-    `start` is what a calibration that is learned from a sample of the runs begins with; None: none
-    is learned.
+    Args:
+        reading: The logs.
+        bayes: How to diagnose.
+        folder: The folder.
+        workforce: Who does the work.
+        start: What a calibration that is learned from a sample of the runs begins with; None: none
+            is learned.
+        stored: The robot in the store, which keeps the diagnoses; None: nothing does.
+        recorded: When the log was recorded (UTC); None: when it was last modified.
+
+    Raises:
+        InputError: If the store should keep several logs.
     """
+    if stored is not None and len(reading.logs) > 1:
+        raise InputError(
+            f"--parquet and --store take one LOG, got {len(reading.logs)}. Diagnose one after the "
+            "other."
+        )
     robot = bayes.twin.robot
     options, correction = with_map(reading.options, reading.columns, reading.logs, robot)
     runs = RunPieces(reading.logs, robot, options)
@@ -60,7 +77,8 @@ def diagnose_many(
             advance,
             tell=lambda text: tell(text, err=True),
         )
-    return _summary(folder)
+    kept = [] if stored is None else [_remember(stored, folder, reading, recorded)]
+    return [*_summary(folder), *kept]
 
 
 def _taught(
@@ -79,7 +97,7 @@ def _taught(
     return found.bayes
 
 
-def remember_many(
+def _remember(
     stored: RobotRecord, folder: Path, reading: LogOptions, recorded: datetime | None
 ) -> str:
     """Store the diagnoses in a folder of results piece by piece, and return a line."""
@@ -90,23 +108,18 @@ def remember_many(
     while some := list(islice(rest, PIECE)):
         done = stored.remember(some, log, first=added + known)
         added, known = added + done.added, known + done.known
-    before = f", {known} known before" if known else ""
-    return f"remembered in {stored.store.name}: {counted(added, 'run')} of {stored.name}{before}"
+    return stored.remembered(counted(added, "run"), known)[0]
 
 
 def _summary(folder: Path) -> list[Part]:
     """Return how many runs have each diagnosis, and scores where the truth is known."""
     diagnoses = list(read_diagnoses(folder, texts=False))
     found = Counter((d.diagnosis or NO_VERDICT, d.state) for d in diagnoses)
-    names = sorted({name for name, _ in found}, key=lambda name: -_total(found, name))
+    total = Counter(d.diagnosis or NO_VERDICT for d in diagnoses)
     rows = [
-        (name, str(_total(found, name)), *(str(found[name, state]) for state in STATES))
-        for name in names
+        (name, str(total[name]), *(str(found[name, state]) for state in STATES))
+        for name in sorted(total, key=lambda name: (-total[name], name))
     ]
     table = figures_table(("most probable", "runs", *STATES), rows)
     count = counted(len(diagnoses), "run")
     return [table, f"\n{count} diagnosed: {folder}", *score_parts(Judged.of(diagnoses))]
-
-
-def _total(found: Counter[tuple[str, str]], name: str) -> int:
-    return sum(found[name, state] for state in STATES)

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import math
-import time
 import tomllib
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -17,31 +13,23 @@ from typing import TYPE_CHECKING, Any
 from failuretwin.app.records import episode_line
 from failuretwin.app.terminal import tell
 from failuretwin.connection.calibration.result import Calibration, calibration_text
-from failuretwin.core.errors import InputError, OutputError, counted
+from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
-from failuretwin.core.runs import concatenate
-from failuretwin.data_knowledge.records.episodes import RAISED
+from failuretwin.core.runs import RunSet, concatenate
 from failuretwin.data_knowledge.records.history import FaultEpisode, StoredCalibration
 from failuretwin.data_knowledge.records.log_files import LogFile, log_file
 from failuretwin.data_knowledge.records.offsets import MotorOffset
 from failuretwin.data_knowledge.records.rows import Basis
-from failuretwin.data_knowledge.records.sessions import Note, Session
+from failuretwin.data_knowledge.records.sessions import Note
 from failuretwin.data_knowledge.records.store import Remembered, Store
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, calibration_from_table
 from failuretwin.digital_model.robot import Robot
-from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.faults.priors import Priors
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from failuretwin.app.commands.options import LogOptions
     from failuretwin.data_knowledge.workers import Workforce
-    from failuretwin.decision.acting.session import AlarmChange
     from failuretwin.decision.test_motions.health_check import CheckResult
-
-
-RETRY_S = 5.0
-"""Time after which entries are tried again on a store that failed [s]."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +101,7 @@ class RobotRecord:
         self,
         diagnoses: Sequence[Diagnosis],
         log: LogFile | None,
-        runs: xr.Dataset | None = None,
+        runs: RunSet | None = None,
         command: str = "diagnose",
         offsets: Sequence[MotorOffset] = (),
         first: int = 0,
@@ -157,20 +145,27 @@ class RobotRecord:
         tell(f"learned priors: {learned.line}", err=True)
         return learned.factors
 
-    def with_learned_priors(self, bayes: BayesDiagnoser) -> BayesDiagnoser:
-        """Return a diagnoser with the priors that the store teaches."""
-        factors = self.fault_factors(bayes.hypothesis_set)
-        return replace(bayes, priors=replace(bayes.priors, fault_factors=factors))
+    def learned_priors(self, hypotheses: Sequence[Hypothesis], usual: Priors) -> Priors:
+        """Return the priors of faults that the store teaches, all others as usual."""
+        return replace(usual, fault_factors=self.fault_factors(hypotheses))
 
     def keeper(self, reading: LogOptions, recorded: datetime | None) -> DiagnosisKeeper:
         """Return what keeps the diagnoses of some logs."""
         return DiagnosisKeeper(self, reading, recorded)
 
-    def work_keeper(self, command: str, known: CalibratedRobot, method: str) -> WorkKeeper:
-        """Return what keeps what a command does with the arm, and why."""
-        figures = known.imperfections
-        method = f"{method}; healthy behaviour: {figures.name}"
-        return WorkKeeper(self, Basis(command, self.calibration_number, method, figures.protocol))
+    def basis(self, command: str, method: str, known: CalibratedRobot) -> Basis:
+        """Return what the results of a command rest on."""
+        healthy = known.imperfections
+        method = f"{method}; healthy behaviour: {healthy.name}"
+        return Basis(command, self.calibration_number, method, healthy.protocol)
+
+    def remembered(
+        self, what: str, known: int = 0, episodes: Iterable[FaultEpisode] = ()
+    ) -> list[str]:
+        """Return what was stored in lines: things, how many were known before, and episodes."""
+        before = f", {known} known before" if known else ""
+        first = f"remembered in {self.store.name}: {what} of {self.name}{before}"
+        return [first, *map(episode_line, episodes)]
 
     def remember_check(
         self, results: Sequence[CheckResult], log: LogFile | None = None
@@ -182,13 +177,10 @@ class RobotRecord:
         found = [result.diagnosis for result in results]
         offsets = _check_offsets(results[-1], self.profile)
         done = self.remember(found, log, command="check", offsets=offsets)
-        before = f", {done.known} known before" if done.known else ""
-        checks = counted(done.added, "check")
-        first = f"remembered in {self.store.name}: {checks} of {self.name}{before}"
-        return [first, *map(episode_line, done.episodes)]
+        return self.remembered(counted(done.added, "check"), done.known, done.episodes)
 
     def register(
-        self, out: Path, runs: xr.Dataset, logs: Sequence[Path], recorded: datetime | None
+        self, out: Path, runs: RunSet, logs: Sequence[Path], recorded: datetime | None
     ) -> str:
         """Store a run set that was written as a log without diagnoses, and return a line.
 
@@ -209,7 +201,7 @@ class RobotRecord:
             runs=names,
             profile=self.profile,
         )
-        return f"remembered in {self.store.name}: {counted(len(names), 'run')} of {self.name}"
+        return self.remembered(counted(len(names), "run"))[0]
 
     def keep_calibration(self, found: Calibration) -> str:
         """Store a calibration, and return what was stored, in a line."""
@@ -221,75 +213,7 @@ class RobotRecord:
             protocol=figures.protocol,
             profile=self.profile,
         )
-        where = f"remembered in {self.store.name}"
-        return f"{where}: calibration {kept.name} of {self.name}, in force from now on"
-
-
-class WorkKeeper:
-    """Stores the entries of a diary while the arm works, in a thread: the arm never waits for it.
-
-    Entries wait where the store fails, and are tried again.
-
-    Args:
-        record: The robot in the store.
-        basis: The command, and what its results rest on.
-    """
-
-    def __init__(self, record: RobotRecord, basis: Basis) -> None:
-        self._record = record
-        self._basis = basis
-        self._session: Session | None = None
-        self._waiting: list[Note] = []
-        self._changed: dict[int, FaultEpisode] = {}
-        self._due_s = -math.inf
-        self._writer = ThreadPoolExecutor(1)
-
-    def keep(self, at: datetime, entry: str | AlarmChange) -> None:
-        """Store an entry of a time (UTC), soon."""
-        self._writer.submit(self._try, _note(at, entry))
-
-    def end(self) -> list[str]:
-        """Store what waits, and return what was stored, in lines.
-
-        Raises:
-            OutputError: If it cannot be stored.
-        """
-        self._writer.shutdown()
-        self._write()
-        command = self._basis.command
-        first = f"remembered in {self._record.store.name}: {command} of {self._record.name}"
-        return [first, *map(episode_line, self._changed.values())]
-
-    def _try(self, note: Note) -> None:
-        self._waiting.append(note)
-        if time.monotonic() >= self._due_s:
-            self._due_s = time.monotonic() + RETRY_S
-            with suppress(OutputError):
-                self._write()
-                self._due_s = -math.inf
-
-    def _write(self) -> None:
-        if self._session is None:
-            self._session = self._begun()
-        changed = self._session.note(*self._waiting)
-        self._waiting = []
-        self._changed |= {one.number: one for one in changed}
-
-    def _begun(self) -> Session:
-        record, command = self._record, self._basis.command
-        log = LogFile(command, None, 0, datetime.now(UTC))
-        return record.store.begin(
-            record.name, self._basis, log=log, runs=[command], profile=record.profile
-        )
-
-
-def _note(at: datetime, entry: str | AlarmChange) -> Note:
-    if isinstance(entry, str):
-        return Note(at, entry)
-    fault = entry.fault
-    alarm = "" if fault is None else f"{fault.motor}:{fault.mode}"
-    certain = fault is None or fault.state == RAISED
-    return Note(at, entry.text, entry.diagnosis, alarm, certain, entry.final)
+        return f"{self.remembered(f'calibration {kept.name}')[0]}, in force from now on"
 
 
 def _check_offsets(result: CheckResult, robot: Robot) -> list[MotorOffset]:
@@ -317,7 +241,7 @@ class DiagnosisKeeper:
         self._stored = stored
         self._reading = reading
         self._recorded = recorded
-        self._parts: list[xr.Dataset] = []
+        self._parts: list[RunSet] = []
 
     @cached_property
     def logs(self) -> list[LogFile]:
@@ -329,7 +253,7 @@ class DiagnosisKeeper:
         """When the last log was recorded (UTC)."""
         return max(log.recorded for log in self.logs)
 
-    def runs(self, robot: Robot, workforce: Workforce) -> xr.Dataset:
+    def runs(self, robot: Robot, workforce: Workforce) -> RunSet:
         """Return the runs of all logs as one run set."""
         self._parts = self._reading.parts(robot, workforce)
         return concatenate(self._parts)
@@ -345,7 +269,4 @@ class DiagnosisKeeper:
             done = self._stored.remember(own, log, part)
             added, known = added + done.added, known + done.known
             changed |= {one.number: one for one in done.episodes}
-        before = f", {known} known before" if known else ""
-        where = f"remembered in {self._stored.store.name}"
-        first = f"{where}: {counted(added, 'run')} of {self._stored.name}{before}"
-        return [first, *(episode_line(one) for one in changed.values())]
+        return self._stored.remembered(counted(added, "run"), known, changed.values())

@@ -85,7 +85,7 @@ def act(
     with ExitStack() as stack:
         commander = commander_of(arm, known, robot.seed, stack)
         if is_moved(arm):
-            with noting(stored, "act", known, strategy) as say:
+            with noting(stored, known, strategy) as say:
                 results = acting.work(wanted, commander, say, say.note)
         else:
             tell("nothing moves without --move; this is what would be ordered")

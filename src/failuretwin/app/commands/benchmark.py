@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,35 +47,28 @@ def list_() -> None:
     )
 
 
-@dataclass(frozen=True)
-class WorkOptions:
-    """Values of `work_options`: which part of the benchmark, and its data."""
+def _work(tasks: str | None, arms: str | None, tracks: str | None, data: Path) -> list[Work]:
+    """Return the cases of a part of the benchmark.
 
-    tasks: str | None
-    arms: str | None
-    tracks: str | None
-    data: Path
+    Recorded runs are left out, with a note, where they are not there.
+    """
+    from failuretwin.decision.benchmark.runner import wanted_work
+    from failuretwin.decision.benchmark.simulated import ARMS
+    from failuretwin.decision.benchmark.tasks import REAL, TASKS, TRACKS
 
-    @property
-    def work(self) -> list[Work]:
-        """The cases; recorded runs are left out, with a note, where they are not there."""
-        from failuretwin.decision.benchmark.runner import wanted_work
-        from failuretwin.decision.benchmark.simulated import ARMS
-        from failuretwin.decision.benchmark.tasks import REAL, TASKS, TRACKS
-
-        tasks = _chosen("task", self.tasks, list(TASKS))
-        if self.tasks is None and not (self.data / REAL).is_dir():
-            tasks.remove("real")
-            tell(
-                f"note: task real is left out: {self.data / REAL} is not there. Fetch it: "
-                f"failuretwin data fetch {REAL} --data {self.data}",
-                err=True,
-            )
-        arms = _chosen("arm", self.arms, list(ARMS))
-        found = wanted_work(tasks, arms, _chosen("track", self.tracks, list(TRACKS)), self.data)
-        if not found:
-            raise InputError("no case has all of these tasks, arms and tracks. See benchmark list.")
-        return found
+    chosen = _chosen("task", tasks, list(TASKS))
+    if tasks is None and not (data / REAL).is_dir():
+        chosen.remove("real")
+        tell(
+            f"note: task real is left out: {data / REAL} is not there. Fetch it: "
+            f"failuretwin data fetch {REAL} --data {data}",
+            err=True,
+        )
+    of_arms = _chosen("arm", arms, list(ARMS))
+    found = wanted_work(chosen, of_arms, _chosen("track", tracks, list(TRACKS)), data)
+    if not found:
+        raise InputError("no case has all of these tasks, arms and tracks. See benchmark list.")
+    return found
 
 
 def _chosen(kind: str, text: str | None, valid: Sequence[str]) -> list[str]:
@@ -87,8 +79,8 @@ def _chosen(kind: str, text: str | None, valid: Sequence[str]) -> list[str]:
 
 
 work_options = opt.gathered(
-    WorkOptions,
-    "part",
+    _work,
+    "work",
     names_option("--tasks", "Tasks."),
     names_option("--arms", "Arms."),
     names_option("--tracks", "Tracks."),
@@ -102,7 +94,7 @@ work_options = opt.gathered(
 )
 @opt.file_option("--out", "DIR", "Folder for answers and results.", required=True)
 @work_options
-def run(method: str, out: Path, part: WorkOptions) -> None:
+def run(method: str, out: Path, work: list[Work]) -> None:
     """Run an entry: a scikit-learn classifier, or a class with diagnose(runs).
 
     Data are made from fixed seeds and checked. Cases that were answered before are kept.
@@ -110,7 +102,6 @@ def run(method: str, out: Path, part: WorkOptions) -> None:
     from failuretwin.app.reports.benchmark_page import score_table
     from failuretwin.decision.benchmark.runner import RESULTS, run_entry
 
-    work = part.work
     kept = sum(one.answers_in(out).exists() for one in work)
     if kept:
         tell(f"note: {counted(kept, 'answered case')} of {out} kept, not answered anew", err=True)

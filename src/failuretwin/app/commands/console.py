@@ -106,13 +106,13 @@ def console(
             arms[name] = _live(name, source, known, live, budget, robot.seed, stored)
         from failuretwin.app.console.demo import ARMS, LOGS
         from failuretwin.app.console.desk import Desk
-        from failuretwin.app.console.server import Listening, serve
+        from failuretwin.app.console.server import serve
 
         reached = access.to(url) if url is not None else None
         speed = live.speed or 1.0
         expected = len(ARMS) + len(LOGS) + demo_robots + bool(demo_robots) if demo else 0
         desk = Desk(known, store, reached, arms, move, speed, folder, expected=expected)
-        serve(desk, Listening(host, port, sessions))
+        serve(desk, host, port, sessions)
 
 
 def _check_free(host: str, port: int) -> None:
@@ -174,20 +174,18 @@ def _live(
     stored: RobotRecord | None,
 ) -> LiveRobot:
     """Return the robot of SOURCE, not yet watched."""
-    from failuretwin.app.arms import connect
+    from failuretwin.app.arms import connect, is_log
     from failuretwin.app.console.live import LiveRobot, LiveSettings
-    from failuretwin.app.watch_keeper import begin_watch
+    from failuretwin.app.keepers import begin_watch
     from failuretwin.connection.links.ros_link import is_network
     from failuretwin.connection.links.ros_messages import load_topics
     from failuretwin.data_knowledge.records.log_files import log_file
-    from failuretwin.data_knowledge.records.rows import Basis
     from failuretwin.decision.streaming.monitor import monitor
 
-    healthy = known.imperfections
     settings = LiveSettings(
         name,
         known,
-        monitor(known.twin, healthy, budget),
+        monitor(known.twin, known.imperfections, budget),
         lambda stack: connect(source, known.robot, live, seed, stack)[0],
         load_topics(live.topics).wait_s,
         tuple(one.partition("@")[0] for one in live.faults) if source == opt.EMULATED else None,
@@ -196,8 +194,6 @@ def _live(
     )
     if stored is None:
         return LiveRobot(settings)
-    method = f"console; healthy behaviour: {healthy.name}"
-    basis = Basis("watch", stored.calibration_number, method, healthy.protocol)
-    replayed = source != opt.EMULATED and Path(source).exists()
-    log = log_file(source) if replayed else None
+    basis = stored.basis("watch", "console", known)
+    log = log_file(source) if is_log(source) else None
     return LiveRobot(settings, partial(begin_watch, stored, source, basis, log))

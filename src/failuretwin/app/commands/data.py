@@ -22,6 +22,7 @@ from failuretwin.app.terminal import progress_bar, show, tell
 from failuretwin.core.errors import InputError, counted
 
 if TYPE_CHECKING:
+    from failuretwin.data_knowledge.workers import Workforce
     from failuretwin.digital_model.urdf.check import UrdfReport
 
 
@@ -43,7 +44,7 @@ def import_(
     memory: StoreOptions,
     recorded: datetime | None,
     reading: opt.LogOptions,
-    force: opt.WorkforceOptions,
+    workforce: Workforce,
     robot: opt.RobotOptions,
 ) -> None:
     """Read logs and write them as one run set.
@@ -56,7 +57,7 @@ def import_(
     if out.resolve() in [log.resolve() for log in reading.logs]:
         raise InputError(f"{out}: is what is to be read. Give another name to write to.")
     stored = memory.record(robot)
-    runs = reading.runs(robot.model, force.workforce)
+    runs = reading.runs(robot.model, workforce)
     export_runs(runs, out, ft.DigitalTwin(robot.model))
     tell(f"{counted(runs.sizes['run'], 'run')} written to {out}")
     if stored is not None:
@@ -120,7 +121,7 @@ def simulate(
     engine: str,
     sensors: str | None,
     faults: Path | None,
-    force: opt.WorkforceOptions,
+    workforce: Workforce,
     robot: opt.RobotOptions,
 ) -> None:
     """Make labelled runs with the digital twin and write them as a run set.
@@ -134,7 +135,7 @@ def simulate(
     from failuretwin.failure_behavior.registry import MODES, load_modes
 
     if robots is not None or years is not None:
-        _simulate_fleet(robots, years, store, force, robot)
+        _simulate_fleet(robots, years, store, workforce, robot)
         return
     if out is None:
         raise InputError("nothing says where to write. Give --out FILE, or --fleet N --years Y.")
@@ -153,7 +154,6 @@ def simulate(
         sensors=[] if sensors is None else [kind.strip() for kind in sensors.split(",")],
         modes=MODES if faults is None else load_modes(faults),
     )
-    workforce = force.workforce
     with progress_bar("simulating", plan.size) as advance:
         produce(plan, out, workforce, advance, tell=lambda text: tell(text, err=True))
     tell(f"{counted(plan.size, 'run')} written to {out}")
@@ -167,7 +167,7 @@ def _simulate_fleet(
     robots: int | None,
     years: float | None,
     store: str | None,
-    force: opt.WorkforceOptions,
+    workforce: Workforce,
     robot: opt.RobotOptions,
 ) -> None:
     from failuretwin.app.simulated_years import Years, last_midnight, write_years
@@ -175,16 +175,12 @@ def _simulate_fleet(
     opt.refuse_unused("lives of robots go into the store", *LIVES)
     if robots is None or years is None or store is None:
         raise InputError("lives need --fleet N, --years Y and --store URL. Give all three.")
-    own = ft.load_calibration(None, robot.robot) if _is_none(robot.calibration) else robot.known
+    ideal = str(robot.calibration) == "none"  # nobody named one, and ideal robots would not wear
+    own = ft.load_calibration(None, robot.robot) if ideal else robot.known
     plan = Years(own, years, last_midnight(), robot.seed)
     with progress_bar("simulating lives", robots) as advance:
-        done = write_years(ft.open_store(store), plan, robots, force.workforce, advance)
+        done = write_years(ft.open_store(store), plan, robots, workforce, advance)
     tell(f"written to {store}: {done}")
-
-
-def _is_none(calibration: Path | None) -> bool:
-    """Return whether nobody has named a calibration: ideal robots would not wear."""
-    return calibration is not None and str(calibration) == "none"
 
 
 # `failuretwin robot`: bring a robot of your own, from its URDF.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,8 +23,6 @@ from failuretwin.app.terminal import show, tell
 from failuretwin.core.errors import InputError
 
 if TYPE_CHECKING:
-    from failuretwin.app.learning import Start
-    from failuretwin.app.remembering import RobotRecord
     from failuretwin.data_knowledge.workers import Workforce
     from failuretwin.inference.together.fault_course import FaultCourse
 
@@ -142,7 +141,7 @@ def diagnose(
     recorded: datetime | None,
     memory: StoreOptions,
     reading: opt.LogOptions,
-    force: opt.WorkforceOptions,
+    workforce: Workforce,
     robot: opt.RobotOptions,
 ) -> None:
     """Diagnose runs from commands and tool path alone, or what other sensors saw (--sensing).
@@ -153,6 +152,7 @@ def diagnose(
     """
     from failuretwin.app import inputs as given
     from failuretwin.app import learning, offsets
+    from failuretwin.app.many_runs import diagnose_many
     from failuretwin.app.reports import reports
     from failuretwin.app.reports.isolability_report import isolability_summary
     from failuretwin.app.reports.technician_page import write_report
@@ -172,21 +172,30 @@ def diagnose(
     )
     _refuse_unused(method == given.BAYES, track, self_calibrate, parquet is not None)
     if learned_priors:
-        bayes = memory.needed(stored, LEARNED).with_learned_priors(bayes)
+        taught = memory.needed(stored, LEARNED).learned_priors(bayes.hypothesis_set, bayes.priors)
+        bayes = replace(bayes, priors=taught)
     start = learning.Start(robot.calibration, out, stored)
     if parquet is not None:
-        many = (reading, bayes, parquet, force.workforce, stored, recorded)
-        _diagnose_many(*many, start if self_calibrate else None)
+        show(
+            *diagnose_many(
+                reading,
+                bayes,
+                parquet,
+                workforce,
+                start if self_calibrate else None,
+                stored,
+                recorded,
+            )
+        )
         return
     keeper = None if stored is None else stored.keeper(reading, recorded)
     diagnoser = given.chosen_diagnoser(method, bayes)
     tracking = learning.Tracking(bayes, start) if track else None
-    runs = (reading if keeper is None else keeper).runs(known.robot, force.workforce)
+    runs = (reading if keeper is None else keeper).runs(known.robot, workforce)
     sensed = sensing_of(runs, sensing)
     given.warn_mismatch(runs, given.expected_name(diagnoser))
-    if together:
-        learning.check_learning_from(sensed)
-    found = learning.found_in(runs, bayes, diagnoser, tracking, start if self_calibrate else None)
+    taught_by = tracking or (start if self_calibrate else None)
+    found = learning.found_in(runs, bayes, diagnoser, taught_by, sensed)
     diagnoses = given.with_doubts(found.diagnoses, runs, known.twin, learned_priors)
     if (sse_range or error_range) and diagnoser is bayes:
         usual = priors_of(known.robot, None, onset)
@@ -208,31 +217,6 @@ def diagnose(
     show(*([""] if last else []), *last)
     show(*offsets.offset_lines(runs, known, diagnoses, reading, correct))
     show(*remembered)
-
-
-def _diagnose_many(
-    reading: opt.LogOptions,
-    bayes: ft.BayesDiagnoser,
-    parquet: Path,
-    workforce: Workforce,
-    stored: RobotRecord | None,
-    recorded: datetime | None,
-    start: Start | None,
-) -> None:
-    """Diagnose runs of any number into parquet files, and store the diagnoses if asked to.
-
-    A calibration is learned from a sample of them first, if there is a `start`.
-    """
-    from failuretwin.app.many_runs import diagnose_many, remember_many
-
-    if stored is not None and len(reading.logs) > 1:
-        raise InputError(
-            f"--parquet and --store take one LOG, got {len(reading.logs)}. Diagnose one after the "
-            "other."
-        )
-    show(*diagnose_many(reading, bayes, parquet, workforce, start))
-    if stored is not None:
-        tell(remember_many(stored, parquet, reading, recorded))
 
 
 def _write(

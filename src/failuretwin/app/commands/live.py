@@ -23,12 +23,10 @@ from failuretwin.connection.links import NETWORKS, ROS1
 from failuretwin.decision.streaming import STREAMED
 
 if TYPE_CHECKING:
-    from failuretwin.app.life_keeper import LifeKeeper
+    from failuretwin.app.keepers import LifeKeeper, WatchKeeper
     from failuretwin.app.remembering import RobotRecord
-    from failuretwin.app.watch_keeper import WatchKeeper
     from failuretwin.connection.links.base import Commander
     from failuretwin.digital_model.calibrated_robot import CalibratedRobot
-    from failuretwin.inference.faults.priors import Priors
 
 
 PROBING = ("idle", "move", *opt.names_of(opt.SafetyOptions))
@@ -98,15 +96,20 @@ def watch(
     from failuretwin.connection.links.recorder import Recorder
     from failuretwin.connection.links.ros_messages import load_topics
     from failuretwin.connection.links.statuses import statuses
+    from failuretwin.core.hypothesis import paper_hypotheses
     from failuretwin.decision.streaming.monitor import monitor
     from failuretwin.decision.streaming.set_up_watch import PROOF
     from failuretwin.decision.test_motions.probing import Prober
+    from failuretwin.inference.faults.priors import Priors
 
     if not probe.probes:
         opt.refuse_unused("nothing is moved without --probe N", *PROBING)
     model, (stored, known) = robot.model, memory.look_up(robot, learned_priors and not track)
     life = _life(memory.needed(stored, "--track")) if track else None
-    priors = _learned_priors(memory.needed(stored, LEARNED)) if learned_priors else None
+    priors = None
+    if learned_priors:
+        considered = paper_hypotheses(model.motor_names)
+        priors = memory.needed(stored, LEARNED).learned_priors(considered, Priors())
     diagnoser = monitor(known.twin, known.imperfections, budget, sensing, life, priors)
     wait_s = load_topics(live.topics).wait_s
     tell(basis_line(known, robot.calibration, budget, "goals" in sensing))
@@ -135,21 +138,12 @@ def watch(
     tell(f"last answer: {arm}")
     if stored is not None:
         tell("" if life is None else life.keep_watch(diagnoser.life))
-        tell(f"remembered in {stored.store.name}: watch of {stored.name}")
-
-
-def _learned_priors(stored: RobotRecord) -> Priors:
-    """Return the priors that the store teaches."""
-    from failuretwin.core.hypothesis import paper_hypotheses
-    from failuretwin.inference.faults.priors import Priors
-
-    considered = paper_hypotheses(stored.profile.motor_names)
-    return Priors(fault_factors=stored.fault_factors(considered))
+        tell(stored.remembered("watch")[0])
 
 
 def _life(stored: RobotRecord) -> LifeKeeper:
     """Return what keeps that which the robot teaches from watch to watch."""
-    from failuretwin.app.life_keeper import LifeKeeper
+    from failuretwin.app.keepers import LifeKeeper
 
     return LifeKeeper(stored, "watch")
 
@@ -162,17 +156,15 @@ def _begun(
     recorded: datetime | None,
 ) -> WatchKeeper:
     """Return what keeps a watch, whose session has begun; a source that is a path is a log."""
-    from failuretwin.app.watch_keeper import begin_watch
+    from failuretwin.app.arms import is_log
+    from failuretwin.app.keepers import begin_watch
     from failuretwin.data_knowledge.records.log_files import log_file
-    from failuretwin.data_knowledge.records.rows import Basis
 
-    healthy = known.imperfections
-    method = f"watch, {sensing}; healthy behaviour: {healthy.name}"
-    basis = Basis("watch", stored.calibration_number, method, healthy.protocol)
-    replayed = source != opt.EMULATED and Path(source).exists()
-    if not replayed:
+    log = log_file(source, recorded) if is_log(source) else None
+    if log is None:
         opt.refuse_unused("only logs were recorded before", "recorded")
-    return begin_watch(stored, source, basis, log_file(source, recorded) if replayed else None)
+    basis = stored.basis("watch", f"watch, {sensing}", known)
+    return begin_watch(stored, source, basis, log)
 
 
 @click.command()
@@ -203,10 +195,9 @@ def emulate(
 
     No real robot is needed. Watch it with `failuretwin watch ros1`.
     """
-    from failuretwin.app import emulating
-    from failuretwin.app.arms import emulation_with, known_arm
+    from failuretwin.app.arms import emulation_with, known_arm, play, play_orders
 
     known = known_arm(robot.model, robot.calibration)
     emulation = emulation_with(live.faults, known, robot.seed)
-    emulate_on = emulating.obey if obey else emulating.play
+    emulate_on = play_orders if obey else play
     emulate_on(target, emulation, live)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import wraps
+from inspect import signature
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -49,19 +50,21 @@ def flag_option(flag: str, text: str) -> Callable[[F], F]:
     return click.option(flag, is_flag=True, help=text)
 
 
-def names_of(kind: type) -> tuple[str, ...]:
+def names_of(make: Callable[..., object]) -> tuple[str, ...]:
     """Return the names of the parameters that a group of options has."""
-    return tuple(field.name for field in fields(kind))
+    return tuple(signature(make).parameters)
 
 
-def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F], F]:
-    """Return a decorator that adds options; the command gets them as one argument, of `kind`."""
+def gathered(
+    make: Callable[..., object], name: str, *options: Callable[[F], F]
+) -> Callable[[F], F]:
+    """Return a decorator that adds options; the command gets one argument, made of their values."""
 
     def decorate(command: F) -> F:
         @wraps(command)
         def with_one(**told: Any) -> Any:
-            own = {option: told.pop(option) for option in names_of(kind) if option in told}
-            return command(**told, **{name: kind(**own)})
+            own = {option: told.pop(option) for option in names_of(make) if option in told}
+            return command(**told, **{name: make(**own)})
 
         decorated: Any = with_one
         for option in reversed(options):
@@ -324,19 +327,10 @@ live_options = gathered(
 # Commands whose work can be spread over processes.
 
 
-@dataclass(frozen=True)
-class WorkforceOptions:
-    """Values of `workforce_options`: who does the work."""
+def _workforce(workers: int, scheduler: str | None) -> Workforce:
+    from failuretwin.data_knowledge.workers import Workforce
 
-    workers: int
-    scheduler: str | None
-
-    @property
-    def workforce(self) -> Workforce:
-        """The processes that do the work."""
-        from failuretwin.data_knowledge.workers import Workforce
-
-        return Workforce(self.workers, self.scheduler)
+    return Workforce(workers, scheduler)
 
 
 def workforce_options(result: str, shared: str) -> Callable[[F], F]:
@@ -345,8 +339,8 @@ def workforce_options(result: str, shared: str) -> Callable[[F], F]:
     `result` does not depend on them; workers of a scheduler must share the files `shared`.
     """
     return gathered(
-        WorkforceOptions,
-        "force",
+        _workforce,
+        "workforce",
         count_option(
             "--workers",
             1,

@@ -15,14 +15,13 @@ from threading import Thread
 import numpy as np
 
 from failuretwin.app.console.live import LiveRobot, LiveSettings
+from failuretwin.app.keepers import begin_watch
 from failuretwin.app.remembering import RobotRecord
 from failuretwin.app.simulated_years import last_midnight
-from failuretwin.app.watch_keeper import begin_watch
 from failuretwin.connection.links.base import Source
 from failuretwin.connection.links.replay import Pace
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.records.log_files import log_file
-from failuretwin.data_knowledge.records.rows import Basis
 from failuretwin.data_knowledge.records.store import Store, open_store
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
@@ -165,13 +164,13 @@ class HistoryWriter:
 
 def demo_arms(store: Store, known: CalibratedRobot, speed: float) -> dict[str, LiveRobot]:
     """Return the emulated arms, not yet watched; the store keeps their alarms."""
-    method = f"console; healthy behaviour: {known.imperfections.name}"
-    found, basis = {}, Basis("watch", None, method, known.imperfections.protocol)
+    found = {}
     for k, (name, (faults, silent_s)) in enumerate(ARMS.items()):
         opened = partial(_emulated, known, faults, silent_s, k, speed)
         watch = monitor(known.twin, known.imperfections)
         still = tuple(fault.partition("@")[0] for fault in faults)
         record = RobotRecord(store, name, known.robot)
+        basis = record.basis("watch", "console", known)
         keep = partial(begin_watch, record, "emulated", basis, None)
         found[name] = LiveRobot(LiveSettings(name, known, watch, opened, faults=still), keep)
     return found

@@ -17,11 +17,11 @@ import numpy as np
 from failuretwin.app.console import state as shown
 from failuretwin.app.console import texts
 from failuretwin.app.console.state import Clock, LiveView, Sample, Tile, Trace
+from failuretwin.app.keepers import WatchKeeper
 from failuretwin.app.live import troubles_of
 from failuretwin.app.shadow import Changes, Shadow
-from failuretwin.app.watch_keeper import WatchKeeper
 from failuretwin.connection.links.base import OK, Answer, Item, Sink, Source
-from failuretwin.connection.links.statuses import BEFORE, UNDECIDED, statuses
+from failuretwin.connection.links.statuses import BEFORE, Status, statuses
 from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.foreign import printable
 from failuretwin.decision.streaming.fleet import SILENCE_S
@@ -42,14 +42,6 @@ SINCE = re.compile(r"since (\d+\.\d) s(?: \((\d+\.\d) to (\d+\.\d) s\))?")
 POLL_S = 0.1
 HANGS_S = 60.0
 """Time without a step from which a watch counts as hanging [s]; a new alarm takes up to 20."""
-
-STATES = {
-    "OK": shown.HEALTHY,
-    "SUSPECTED": shown.SUSPECTED,
-    "ALARM": shown.ALARM,
-    UNDECIDED: shown.UNDECIDED,
-    "STALE": shown.STALE,
-}
 
 
 @dataclass(frozen=True)
@@ -107,7 +99,7 @@ class LiveRobot(Sink):
         empty = Answer(0.0, "STALE", None)
         tile = Tile(settings.name, settings.known.robot.name, shown.WAITING, "", texts.NEVER, None)
         now = tuple(statuses(empty, motors))
-        self.view = LiveView(tile, 0.0, None, now, None, empty.alarm, ())
+        self.view = LiveView(tile, None, now, None, empty.alarm, ())
         self._thread = Thread(target=self._run, name=f"watch {settings.name}", daemon=True)
 
     def start(self) -> None:
@@ -129,8 +121,7 @@ class LiveRobot(Sink):
         tile, silent_s = self.view.tile, time.monotonic() - self._seen_s
         if silent_s < HANGS_S or tile.state == shown.STALE:
             return tile
-        said = texts.LAST_WORD.format(said=tile.said)
-        return replace(tile, state=shown.STALE, said=said)
+        return tile.silent
 
     def trace(self) -> Trace:
         """Return the motion of the last minutes."""
@@ -237,8 +228,7 @@ class LiveRobot(Sink):
         self._seen_s = time.monotonic()
         now = tuple(statuses(answer, self.settings.known.robot.motor_names))
         self.view = LiveView(
-            self._tile(shadow, now[0].state, now[0].message),
-            at,
+            self._tile(shadow, now[0]),
             last,
             now,
             diagnosis,
@@ -256,14 +246,14 @@ class LiveRobot(Sink):
             self._begun += 1
         return np.asarray(ramp.at(at))
 
-    def _tile(self, shadow: Shadow, word: str, message: str) -> Tile:
+    def _tile(self, shadow: Shadow, arm: Status) -> Tile:
         own, alarm = self.settings, shadow.snapshot.answer.alarm
-        message = self.dated(message)
-        state, said = STATES[word], message
+        message = self.dated(arm.message)
+        state, said = shown.STATES[arm.state], message
         if message.startswith(BEFORE):
             said = texts.LAST_WORD.format(said=message.removeprefix(BEFORE))
         waiting = shadow.snapshot.answer.diagnosis is None
-        if waiting and self._heard is not None and word == "STALE":
+        if waiting and self._heard is not None and arm.state == "STALE":
             silent = (datetime.now(UTC) - self._heard).total_seconds() > SILENCE_S
             state = shown.STALE if silent else shown.WAITING
         diagnosis = shadow.snapshot.answer.diagnosis
@@ -275,7 +265,6 @@ class LiveRobot(Sink):
 
     def _end(self, why: str) -> None:
         """Show the robot as stale, with its last word."""
-        tile = self.view.tile
-        said = tile.said if tile.state == shown.STALE else texts.LAST_WORD.format(said=tile.said)
-        said = f"{why}; {said}" if why else said
-        self.view = replace(self.view, tile=replace(tile, state=shown.STALE, said=printable(said)))
+        tile = self.view.tile if self.view.tile.state == shown.STALE else self.view.tile.silent
+        said = f"{why}; {tile.said}" if why else tile.said
+        self.view = replace(self.view, tile=replace(tile, said=printable(said)))
