@@ -16,7 +16,6 @@ import torch
 from failuretwin.decision.learned.diagnoser import MotorwiseDiagnoser
 from failuretwin.decision.learned.moment_encoder import MomentEncoder, Tokens
 from failuretwin.decision.learned.networks import (
-    Shape,
     build_network,
     shuffled_batches,
     training,
@@ -47,7 +46,7 @@ def paper_training(cores: int) -> float:
     features = rng.standard_normal((3240, 100, 6)).astype(np.float32)
     classes = rng.integers(0, 9, 3240)
     torch.set_num_threads(cores)
-    network = build_network("lstm", Shape(6, 9))
+    network = build_network("lstm", 6, 9)
     batches = shuffled_batches(features, classes, 32, rng)
     steps = in_bfloat16(training(network, batches, 1000))
     for _ in itertools.islice(steps, 10):

@@ -10,7 +10,6 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.decision.learned.feature_encoder import (
     FeatureEncoder,
-    expectation_of,
     signals_of,
 )
 from failuretwin.digital_model.nonidealities import Imperfections, Readings
@@ -38,7 +37,7 @@ def some_runs(robot, hypothesis, imperfections=SAGGING):
 
 def expecting(imperfections, robot, runs):
     """Return robust features of a robot that is expected to have some imperfections."""
-    encoder = FeatureEncoder("robust", robot, expectation_of(robot, imperfections))
+    encoder = FeatureEncoder("robust", robot, imperfections)
     return encoder.encode(signals_of(runs))
 
 
@@ -110,9 +109,7 @@ def test_joint_axes_are_those_that_the_tool_turns_about(armpi, twin):
 
 def test_nothing_is_off_on_a_healthy_arm_at_rest(armpi):
     runs = some_runs(armpi, "healthy")
-    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(
-        signals_of(runs)
-    )
+    features = FeatureEncoder("robust", armpi, SAGGING).encode(signals_of(runs))
     turn = undo(channel(armpi, features, "turn")[:, settled()], TURN_RAD)
     plain = FeatureEncoder("robust", armpi).encode(signals_of(runs))
     without = undo(channel(armpi, plain, "turn")[:, settled()], TURN_RAD)
@@ -123,9 +120,7 @@ def test_nothing_is_off_on_a_healthy_arm_at_rest(armpi):
 @pytest.mark.parametrize("motor", [0, 1, 2, 3])
 def test_a_stuck_motor_explains_all_and_keeps_its_angle(armpi, motor):
     runs = some_runs(armpi, f"motor_{motor + 1}:stuck")
-    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(
-        signals_of(runs)
-    )
+    features = FeatureEncoder("robust", armpi, SAGGING).encode(signals_of(runs))
     misfit = undo(channel(armpi, features, "misfit")[:, settled()], DISTANCE_M)
     angle = channel(armpi, features, "angle")[:, settled(), motor]
     median = np.median(misfit, axis=(0, 1))
@@ -137,9 +132,7 @@ def test_a_stuck_motor_explains_all_and_keeps_its_angle(armpi, motor):
 
 def test_errors_of_a_motor_are_read_off_its_channel(armpi):
     runs = some_runs(armpi, "motor_2:steady_state_error")
-    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(
-        signals_of(runs)
-    )
+    features = FeatureEncoder("robust", armpi, SAGGING).encode(signals_of(runs))
     turn = undo(channel(armpi, features, "turn")[..., 1], TURN_RAD)[:, 19::20]
     true = [json.loads(text)["faults"][0]["offset_rad"] for text in runs["fault_detail"].values]
     assert np.median(np.abs(turn - true)) < 0.01
@@ -149,9 +142,7 @@ def test_errors_of_a_motor_are_read_off_its_channel(armpi):
 def test_points_without_a_reading_are_marked_and_say_nothing(armpi):
     runs = some_runs(armpi, "motor_1:stuck")
     runs["measured"].values[:, 300:600] = np.nan
-    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(
-        signals_of(runs)
-    )
+    features = FeatureEncoder("robust", armpi, SAGGING).encode(signals_of(runs))
     missing = slice(31, 59)
     assert not features[:, missing, -1].any()
     assert features[:, :30, -1].all()
@@ -163,9 +154,7 @@ def test_points_without_a_reading_are_marked_and_say_nothing(armpi):
 def test_a_glitch_counts_little_more_than_a_fault(armpi):
     runs = some_runs(armpi, "healthy")
     runs["measured"].values[:, 500] = 5.0  # far outside the workspace
-    features = FeatureEncoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(
-        signals_of(runs)
-    )
+    features = FeatureEncoder("robust", armpi, SAGGING).encode(signals_of(runs))
     assert np.abs(features).max() < 4.0
 
 

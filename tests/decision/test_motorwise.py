@@ -23,9 +23,8 @@ from failuretwin.decision.learned.diagnoser import (
     check_modes,
 )
 from failuretwin.decision.learned.estimates import Onset, Size, fitted_factor
-from failuretwin.decision.learned.labels import Labels
 from failuretwin.decision.learned.moment_encoder import MomentEncoder, Tokens
-from failuretwin.decision.learned.motorwise import onset_bins
+from failuretwin.decision.learned.motorwise import Labels, onset_bins
 from failuretwin.decision.learned.networks import device_of
 from failuretwin.decision.learned.storage import export_onnx, load_network, save_network
 from failuretwin.decision.training_data import PopulationData, PopulationStream

@@ -91,10 +91,9 @@ def test_the_gradient_is_reversed():
 
 def test_the_past_alone_decides_a_temporal_convolution():
     torch = pytest.importorskip("torch")
-    from failuretwin.decision.learned.networks import Shape
-    from failuretwin.decision.rivals.networks import build
+    from failuretwin.decision.learned.networks import build_network
 
-    network = build("tcn", Shape(2, 3)).eval()
+    network = build_network("tcn", 2, 3).eval()
     x = torch.zeros(1, 70, 2)
     later = x.clone()
     later[0, 0] = 5.0  # 62 steps before the last one is the furthest that is seen

@@ -16,7 +16,6 @@ from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.decision.learned.feature_encoder import (
     FeatureEncoder,
     augmented_features,
-    expectation_of,
     original_features,
     signals_of,
 )
@@ -73,7 +72,7 @@ def healthy(which, robot):
 
 
 def robust_features(robot, imperfections, runs):
-    encoder = FeatureEncoder("robust", robot, expectation_of(robot, imperfections))
+    encoder = FeatureEncoder("robust", robot, imperfections)
     return encoder.residuals(signals_of(runs))
 
 

@@ -18,9 +18,8 @@ from failuretwin.core.hypothesis import Hypothesis, single_faults
 from failuretwin.core.runs import RunTable, concatenate
 from failuretwin.core.types import IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
-from failuretwin.decision.learned.labels import Labels
 from failuretwin.decision.learned.moment_encoder import MomentEncoder, Tokens
-from failuretwin.decision.learned.motorwise import Batch
+from failuretwin.decision.learned.motorwise import Batch, Labels
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.nonidealities import SETTLING_LISTS, Imperfections, vary

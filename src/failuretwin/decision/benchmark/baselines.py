@@ -13,7 +13,7 @@ from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
 from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.learned.feature_encoder import Signals, expectation_of, signals_of
+from failuretwin.decision.learned.feature_encoder import Signals, mean_lag_s, signals_of
 from failuretwin.digital_model.arm_classes import class_of, generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.twin import DigitalTwin
@@ -120,7 +120,7 @@ class KalmanBank(Calibrated):
         """Return the angles of a healthy arm, (run, time, motor) [rad]."""
         robot, healthy, time = self.twin.robot, self.healthy(runs), signals.time
         angle = signals.command.copy()
-        for motor, lag in enumerate(expectation_of(robot, healthy).lag_s):
+        for motor, lag in enumerate(mean_lag_s(robot, healthy)):
             for run, command in enumerate(signals.command[..., motor]):
                 angle[run, :, motor] = np.interp(time - lag, time, command)
         if healthy.settling is None:

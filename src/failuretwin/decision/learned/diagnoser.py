@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
@@ -22,17 +22,17 @@ from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import FloatArray, IntArray, as_floats
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.decision.learned.estimates import Held, Onset, Size, fitted_factor
-from failuretwin.decision.learned.labels import Labels
 from failuretwin.decision.learned.log_pool import PoolWeights
 from failuretwin.decision.learned.moment_encoder import MomentEncoder, Tokens
 from failuretwin.decision.learned.motorwise import (
     Batch,
+    Labels,
     MotorwiseNetwork,
     Told,
     motorwise_training,
     told_of,
 )
-from failuretwin.decision.learned.networks import device_of
+from failuretwin.decision.learned.networks import device_of, shuffled
 from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import Signature
@@ -91,14 +91,14 @@ class MotorwiseDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         tokens, labels = self._tokens(X), self._labels(X, y)
         counts = movement_counts(X)
         rng = np.random.default_rng(check_random_state(self.random_state).randint(2**31))
-        batches = _shuffled(self.batch_of(tokens, labels), self.batch_runs, rng)
+        batch = self.batch_of(tokens, labels)
+        batches = (batch[chosen] for chosen in shuffled(len(batch), self.batch_runs, rng))
         movements = int(counts.min()), int(counts.max())
         return self.fit_batches(batches, [tokens], movements, [encoder.robot.name])
 
     def batch_of(self, tokens: Tokens, labels: Labels) -> Batch:
         """Return runs with their truth as the network learns them."""
-        truth = labels.motor, labels.mode, labels.onset, labels.size
-        return Batch.of(tokens, *truth, np.array([is_angle(mode) for mode in self.modes]))
+        return Batch.of(tokens, labels, np.array([is_angle(mode) for mode in self.modes]))
 
     def fit_batches(
         self,
@@ -312,8 +312,8 @@ class MotorwiseDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     @property
     def about(self) -> tuple[str, str]:
         """Protocol and method, for results."""
-        encoder = self.coder
-        return encoder.protocol, f"network; healthy behaviour: {encoder.expected.name}"
+        known = self.coder.imperfections
+        return known.protocol, f"network; healthy behaviour: {known.name}"
 
     @property
     def known_robot(self) -> Robot:
@@ -380,15 +380,6 @@ def movement_counts(runs: xr.Dataset) -> IntArray:
     """Return the number of movements of each run, (run,)."""
     command, time = as_floats(runs["command"].values), as_floats(runs["time"].values)
     return find_movements(command, time).exists.sum(axis=1)
-
-
-def _shuffled(batch: Batch, size: int, rng: np.random.Generator) -> Iterator[Batch]:
-    """Yield batches without end, in a new random order each epoch."""
-    size = min(size, len(batch))
-    while True:
-        order: IntArray = rng.permutation(len(batch))
-        for first in range(0, len(order) - size + 1, size):
-            yield batch[order[first : first + size]]
 
 
 TEMPERATURES = (0.05, 20.0)

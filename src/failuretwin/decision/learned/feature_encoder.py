@@ -9,7 +9,6 @@ distance, both compressed by asinh. Points without a reading are zero and marked
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -115,31 +114,12 @@ DAMPING_M = 0.003
 """Distance of the tool from a joint axis at which the turn is halved [m]."""
 
 
-@dataclass(frozen=True)
-class Expectation:
-    """Expected healthy behaviour: the parts of a calibration that features depend on.
-
-    Attributes:
-        name: Name of the calibration.
-        protocol: Protocol letter of the calibration.
-        lag_s: Mean lag of each motor behind its command, (motor,) [s].
-        settling: Settling errors of the motors.
-    """
-
-    name: str
-    protocol: str
-    lag_s: tuple[float, ...]
-    settling: Settling
-
-
-def expectation_of(robot: Robot, imperfections: Imperfections) -> Expectation:
-    """Return the expected healthy behaviour of a robot with these imperfections."""
+def mean_lag_s(robot: Robot, imperfections: Imperfections) -> FloatArray:
+    """Return the mean lag of each motor of a healthy robot behind its command, (motor,) [s]."""
     timing = imperfections.timing
     common = float(np.mean(timing.delay_s) + np.mean(timing.lag_s))
     # 1 / I: delay of the loop (P s + I) / (s (tau s + 1)^2 + P s + I) at low frequency.
-    lag = tuple(common + 1.0 / motor.loop.I for motor in robot.motors)
-    settling = imperfections.settling or Settling.ideal(len(lag))
-    return Expectation(imperfections.name, imperfections.protocol, lag, settling)
+    return np.array([common + 1.0 / motor.loop.I for motor in robot.motors])
 
 
 def _points(signals: Signals) -> tuple[IntArray, FloatArray]:
@@ -201,12 +181,12 @@ class FeatureEncoder:
     Attributes:
         features: One of `FEATURE_SETS`.
         robot: The robot.
-        expected: Healthy behaviour for the robust features; None: that of the published twin.
+        healthy: Healthy behaviour that the robust features expect, such as a calibration.
     """
 
     features: str
     robot: Robot
-    expected: Expectation | None = None
+    healthy: Imperfections = NO_IMPERFECTIONS
 
     def __post_init__(self) -> None:
         if self.features not in FEATURE_SETS:
@@ -217,16 +197,6 @@ class FeatureEncoder:
                 f"robust features know joints that turn, and {', '.join(sliding)} of "
                 f"{self.robot.name!r} slides. Use another method."
             )
-
-    @property
-    def protocol(self) -> str:
-        """Protocol letter of the features."""
-        return "P0" if self.expected is None else self.expected.protocol
-
-    @cached_property
-    def healthy(self) -> Expectation:
-        """Healthy behaviour that the robust features expect."""
-        return self.expected or expectation_of(self.robot, NO_IMPERFECTIONS)
 
     def encode(self, signals: Signals) -> Floats:
         """Return features (run, point, channel)."""
@@ -254,7 +224,7 @@ class FeatureEncoder:
 
     def _healthy_pose(self, signals: Signals, index: IntArray) -> FloatArray:
         """Return the pose of a healthy arm at samples `index`, (run, point, motor) [rad]."""
-        command, lag = signals.command, np.asarray(self.healthy.lag_s)
+        command, lag = signals.command, mean_lag_s(self.robot, self.healthy)
         place = np.maximum(index[..., None] - lag / signals.step, 0.0)
         low = place.astype(np.int64)
         high = np.minimum(low + 1, command.shape[1] - 1)
@@ -262,4 +232,5 @@ class FeatureEncoder:
         before, after = command[run, low, motor], command[run, high, motor]
         pose = before + (place - low) * (after - before)
         direction = _direction(command)[run, low, motor]
-        return pose + self.healthy.settling.offset(self.robot, pose, direction)
+        settling = self.healthy.settling or Settling.ideal(len(lag))
+        return pose + settling.offset(self.robot, pose, direction)

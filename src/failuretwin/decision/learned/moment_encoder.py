@@ -13,9 +13,9 @@ of their deviation, so that arms of any size look alike.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.learned.moment_features import MomentFeatures
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
-from failuretwin.digital_model.nonidealities import Imperfections
-from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.engine.moments import Moments, moments_of
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -41,7 +39,40 @@ BINS = PLATEAU_BINS + RAMP_BINS
 
 
 @dataclass(frozen=True)
-class Tokens:
+class RunArrays:
+    """Arrays of runs; the first axis of each is the run."""
+
+    def __len__(self) -> int:
+        """How many runs."""
+        return len(next(iter(self.arrays.values())))
+
+    def __getitem__(self, runs: NDArray[np.int64] | slice) -> Self:
+        """Return some runs."""
+        return self._each(lambda values: values[runs])
+
+    @property
+    def arrays(self) -> dict[str, Any]:
+        """All arrays, by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def _each(self, change: Callable[[Any], Any]) -> Self:
+        """Return the same with every array changed."""
+        return replace(self, **{name: change(values) for name, values in self.arrays.items()})
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Return the runs of several sets."""
+        found = {name: [part.arrays[name] for part in parts] for name in parts[0].arrays}
+        return cls(**{name: _joined(values) for name, values in found.items()})
+
+
+def _joined(values: Sequence[Any]) -> Any:
+    first = values[0]
+    return (first.joined if isinstance(first, RunArrays) else np.concatenate)(values)
+
+
+@dataclass(frozen=True)
+class Tokens(RunArrays):
     """Runs as the network takes them.
 
     Attributes:
@@ -56,23 +87,6 @@ class Tokens:
     exists: BoolArray
     anchor: Floats
     edges: Floats
-
-    @property
-    def arrays(self) -> tuple[NDArray[Any], ...]:
-        """All arrays, in the order of attributes."""
-        return self.features, self.exists, self.anchor, self.edges
-
-    def __len__(self) -> int:
-        """How many runs."""
-        return len(self.exists)
-
-    def __getitem__(self, runs: NDArray[np.int64] | slice) -> Tokens:
-        """Return some runs."""
-        return self._each(lambda values: values[runs])
-
-    def _each(self, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Tokens:
-        """Return the same with every array changed."""
-        return Tokens(*(change(values) for values in self.arrays))
 
     @property
     def lengths(self) -> IntArray:
@@ -97,36 +111,17 @@ class Tokens:
     def joined(cls, parts: Sequence[Tokens]) -> Tokens:
         """Return the runs of several sets, the shorter ones padded."""
         most = max(part.exists.shape[1] for part in parts)
-        columns = zip(*(part.padded(most).arrays for part in parts), strict=True)
-        return cls(*(np.concatenate(column) for column in columns))
+        return super().joined([part.padded(most) for part in parts])
 
 
 @dataclass(frozen=True)
-class MomentEncoder:
-    """Turns runs of a robot into tokens.
-
-    Attributes:
-        robot: The robot.
-        imperfections: What is known of its healthy behaviour.
-    """
-
-    robot: Robot
-    imperfections: Imperfections
-
-    @property
-    def protocol(self) -> str:
-        """Protocol letter of what is known."""
-        return self.imperfections.protocol
-
-    @property
-    def expected(self) -> Imperfections:
-        """What is known of the healthy behaviour; it carries the name of the calibration."""
-        return self.imperfections
+class MomentEncoder(CalibratedRobot):
+    """Turns runs of a robot, with what is known of its healthy behaviour, into tokens."""
 
     @cached_property
     def model(self) -> HealthyModel:
         """The healthy robot."""
-        return HealthyModel.of(CalibratedRobot(self.robot, self.imperfections))
+        return HealthyModel.of(self)
 
     def encode(self, runs: xr.Dataset) -> Tokens:
         """Return the tokens of runs; reads `command` and `measured` alone."""

@@ -17,6 +17,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -25,10 +26,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim.lr_scheduler import OneCycleLR
 
-from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.decision.learned.moment_encoder import BINS, Tokens
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.types import FloatArray, IntArray, as_floats
+from failuretwin.decision.learned.moment_encoder import BINS, RunArrays, Tokens
 from failuretwin.decision.learned.moment_features import FEATURES
-from failuretwin.decision.learned.networks import DROPOUT
+from failuretwin.decision.learned.networks import DROPOUT, descent
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 WIDTH, BLOCKS = 48, 3
 """Features of a token inside the network, and blocks that exchange them."""
@@ -139,7 +145,52 @@ LOG_SIZE_SCALE = 0.3
 
 
 @dataclass(frozen=True)
-class Batch:
+class Labels(RunArrays):
+    """Truth of runs.
+
+    Attributes:
+        motor: Index of the faulty motor, (run,); 0 if healthy.
+        mode: Index of its mode, (run,); -1 if healthy.
+        onset: (run,) [s]; NaN if healthy.
+        size: In the unit of the mode, (run,); NaN if healthy.
+    """
+
+    motor: IntArray
+    mode: IntArray
+    onset: FloatArray
+    size: FloatArray
+
+    @classmethod
+    def of_runs(
+        cls, runs: xr.Dataset, faults: Sequence[str], motors: Sequence[str], modes: Sequence[str]
+    ) -> Labels:
+        """Return the labels of a run set.
+
+        Args:
+            runs: The runs, with onset and magnitude of their faults.
+            faults: Name of the class of each.
+            motors: Names of the motors.
+            modes: Ids of the modes.
+
+        Raises:
+            InputError: If a class is none of a single fault of these modes, or onset or size are
+                missing.
+        """
+        known = [Hypothesis.parse(name).faults for name in faults]
+        for name, fault in zip(faults, known, strict=True):
+            if len(fault) > 1 or any(one.mode not in modes for one in fault):
+                raise InputError(f"class {name!r}: expected healthy or one of {', '.join(modes)}.")
+        missing = [name for name in ("onset", "magnitude") if name not in runs]
+        if missing:
+            raise InputError(f"the run set lacks {' and '.join(missing)} of its faults.")
+        motor = np.array([motors.index(fault[0].motor) if fault else 0 for fault in known])
+        mode = np.array([modes.index(fault[0].mode) if fault else -1 for fault in known])
+        onset, size = (as_floats(runs[name].values) for name in ("onset", "magnitude"))
+        return cls(motor, mode, onset, size)
+
+
+@dataclass(frozen=True)
+class Batch(RunArrays):
     """Some runs with their truth, as arrays.
 
     Attributes:
@@ -160,45 +211,21 @@ class Batch:
     size: NDArray[np.float32]
     angle: NDArray[np.bool_]
 
-    def __len__(self) -> int:
-        """How many runs."""
-        return len(self.tokens)
-
-    def __getitem__(self, runs: IntArray | slice) -> Batch:
-        """Return some runs."""
-        motor, mode, row, place = (v[runs] for v in (self.motor, self.mode, self.row, self.bin))
-        size, angle = self.size[runs], self.angle[runs]
-        return Batch(self.tokens[runs], motor, mode, row, place, size, angle)
-
     def cut(self) -> Batch:
         """Return the same without room that no run needs."""
         return replace(self, tokens=self.tokens.cut())
 
     @classmethod
-    def of(
-        cls,
-        tokens: Tokens,
-        motor: IntArray,
-        mode: IntArray,
-        onset: FloatArray,
-        size: FloatArray,
-        is_angle: NDArray[np.bool_],
-    ) -> Batch:
+    def of(cls, tokens: Tokens, labels: Labels, is_angle: NDArray[np.bool_]) -> Batch:
         """Return runs with their truth; `is_angle` says of each mode whether its size is held."""
+        motor, mode = labels.motor, labels.mode
         faulty = mode >= 0
-        row, place = onset_bins(tokens, motor, np.where(faulty, onset, 0.0))
+        row, place = onset_bins(tokens, motor, np.where(faulty, labels.onset, 0.0))
         angle = faulty & is_angle[np.maximum(mode, 0)]
-        known = np.where(faulty, size, 1.0)
+        known = np.where(faulty, labels.size, 1.0)
         log_size = np.log(np.maximum(np.abs(known), 1e-6))
         z = np.where(angle, known, log_size).astype(np.float32)
         return cls(tokens, motor, mode, row, place, z, angle)
-
-    @classmethod
-    def joined(cls, parts: Sequence[Batch]) -> Batch:
-        """Return the runs of several batches of one arm."""
-        tokens = Tokens.joined([part.tokens for part in parts])
-        names = ("motor", "mode", "row", "bin", "size", "angle")
-        return cls(tokens, *(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
 
 def onset_bins(tokens: Tokens, motor: IntArray, onset: FloatArray) -> tuple[IntArray, IntArray]:
@@ -256,14 +283,8 @@ def motorwise_training(
     network.to(where)
     optimizer = torch.optim.AdamW(network.parameters(), lr=learning_rate, weight_decay=0.01)
     schedule = OneCycleLR(optimizer, learning_rate, total_steps=iterations + 1, pct_start=0.1)
-    for done, batch in enumerate(islice(batches, iterations), start=1):
-        network.train()
-        optimizer.zero_grad()
-        torch.autograd.backward(loss_of(network, batch, where))
-        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimizer.step()
-        schedule.step()
-        yield done
+    some = islice(batches, iterations)
+    return descent(network, some, lambda batch: loss_of(network, batch, where), schedule, 1.0)
 
 
 @dataclass(frozen=True)

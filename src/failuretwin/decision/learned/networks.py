@@ -1,23 +1,24 @@
-"""Networks on features and their training loop: the paper's LSTM, and a CNN.
+"""Networks on features and the training loop: the paper's LSTM, a CNN, and two of others.
 
 Each maps standardised features (run, point, channel) to logits (run, class).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
+from typing import TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.optim.lr_scheduler import ConstantLR, CosineAnnealingLR
+from torch.optim.lr_scheduler import ConstantLR, CosineAnnealingLR, LRScheduler
 
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.decision.learned.feature_encoder import Floats
+from failuretwin.decision.learned.feature_encoder import POINTS, Floats
 
 HIDDEN = 100
 """Units of both LSTM layers (Table I of the paper)."""
@@ -28,30 +29,20 @@ STRIDES = (1, 2, 2, 1)
 """Stride of each convolution: 100 points become 50, then 25."""
 KERNEL = 5
 """Kernel size of each convolution [points]."""
-
-
-@dataclass(frozen=True)
-class Shape:
-    """Input and output sizes of a network.
-
-    Attributes:
-        channels: Channels of each point.
-        classes: Number of classes.
-    """
-
-    channels: int
-    classes: int
+WIDTH = 64
+"""Channels of the networks of others."""
+T = TypeVar("T")
 
 
 class PaperLstm(nn.Module):
     """The paper's network: LSTM 100, dropout 0.1, LSTM 100, last step, one dense layer."""
 
-    def __init__(self, shape: Shape) -> None:
+    def __init__(self, channels: int, classes: int) -> None:
         super().__init__()
-        self.first = nn.LSTM(shape.channels, HIDDEN, batch_first=True)
+        self.first = nn.LSTM(channels, HIDDEN, batch_first=True)
         self.dropout = nn.Dropout(DROPOUT)
         self.second = nn.LSTM(HIDDEN, HIDDEN, batch_first=True)
-        self.dense = nn.Linear(HIDDEN, shape.classes)
+        self.dense = nn.Linear(HIDDEN, classes)
         for layer in (self.first, self.second):
             _initialise_as_published(layer)
         nn.init.xavier_uniform_(self.dense.weight)
@@ -82,16 +73,16 @@ def _initialise_as_published(layer: nn.LSTM) -> None:
 class Cnn(nn.Module):
     """Four convolutions over time, mean and maximum over time, one hidden layer."""
 
-    def __init__(self, shape: Shape) -> None:
+    def __init__(self, channels: int, classes: int) -> None:
         super().__init__()
         wide = CNN_WIDTH
         self.convolutions = nn.ModuleList(
             nn.Conv1d(taken, wide, KERNEL, stride=stride, padding=KERNEL // 2)
-            for taken, stride in zip((shape.channels, wide, wide, wide), STRIDES, strict=True)
+            for taken, stride in zip((channels, wide, wide, wide), STRIDES, strict=True)
         )
         self.dropout = nn.Dropout(DROPOUT)
         self.hidden = nn.Linear(2 * wide, wide)
-        self.dense = nn.Linear(wide, shape.classes)
+        self.dense = nn.Linear(wide, classes)
 
     def seen(self, x: Tensor) -> Tensor:
         """Return the features behind the last layer, (run, feature)."""
@@ -106,15 +97,69 @@ class Cnn(nn.Module):
         return self.dense(self.seen(x))
 
 
-NETWORKS: dict[str, type[PaperLstm] | type[Cnn]] = {"lstm": PaperLstm, "cnn": Cnn}
+class Tcn(nn.Module):
+    """Temporal convolutions: five causal, dilated residual blocks, last step (Bai et al., 2018)."""
+
+    DILATIONS = (1, 2, 4, 8, 16)
+    KERNEL = 3
+
+    def __init__(self, channels: int, classes: int) -> None:
+        super().__init__()
+        self.first = nn.Conv1d(channels, WIDTH, 1)
+        self.blocks = nn.ModuleList(
+            nn.Conv1d(WIDTH, WIDTH, self.KERNEL, dilation=d) for d in self.DILATIONS
+        )
+        self.dropout = nn.Dropout1d(DROPOUT)  # of whole channels, as there
+        self.dense = nn.Linear(WIDTH, classes)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return logits (run, class)."""
+        x = self.first(x.permute(0, 2, 1))
+        for block, dilation in zip(self.blocks, self.DILATIONS, strict=True):
+            past = nn.functional.pad(x, ((self.KERNEL - 1) * dilation, 0))
+            x = x + self.dropout(torch.relu(block(past)))
+        return self.dense(x[:, :, -1])
+
+
+class Transformer(nn.Module):
+    """Two encoder layers with learned positions, mean over time (Vaswani et al., 2017).
+
+    A token holds two points, which takes half of the time.
+    """
+
+    PATCH = 2
+
+    def __init__(self, channels: int, classes: int) -> None:
+        super().__init__()
+        self.embed = nn.Linear(self.PATCH * channels, WIDTH)
+        self.position = nn.Parameter(0.02 * torch.randn(POINTS // self.PATCH, WIDTH))
+        layer = nn.TransformerEncoderLayer(WIDTH, 4, 2 * WIDTH, DROPOUT, batch_first=True)
+        self.layers = nn.TransformerEncoder(layer, 2, enable_nested_tensor=False)
+        self.dense = nn.Linear(WIDTH, classes)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return logits (run, class)."""
+        tokens = self.embed(x.reshape(len(x), POINTS // self.PATCH, -1))
+        return self.dense(self.layers(tokens + self.position).mean(dim=1))
+
+
+NETWORKS: dict[str, Callable[[int, int], nn.Module]] = {
+    "lstm": PaperLstm,
+    "cnn": Cnn,
+    "tcn": Tcn,
+    "transformer": Transformer,
+}
 """The networks on features by name."""
 
 
-def build_network(name: str, shape: Shape) -> nn.Module:
-    """Return a new network with random weights from torch's generator."""
+def build_network(name: str, channels: int, classes: int) -> nn.Module:
+    """Return a new network with random weights from torch's generator.
+
+    Points have so many channels; the network tells so many classes apart.
+    """
     if name not in NETWORKS:
         raise unknown_name("network", name, NETWORKS)
-    return NETWORKS[name](shape)
+    return NETWORKS[name](channels, classes)
 
 
 # Training loop.
@@ -163,12 +208,33 @@ def training(
     optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate)
     schedule = CosineAnnealingLR(optimizer, iterations) if decay else ConstantLR(optimizer, 1.0)
     measure = nn.CrossEntropyLoss()
-    for done, (features, classes) in enumerate(islice(batches, iterations), start=1):
+
+    def loss_of(batch: Batch) -> Tensor:
+        features, classes = (torch.from_numpy(values).to(where) for values in batch)
+        loss: Tensor = measure(network(features), classes)
+        return loss
+
+    return descent(network, islice(batches, iterations), loss_of, schedule)
+
+
+def descent(
+    network: nn.Module,
+    batches: Iterable[T],
+    loss_of: Callable[[T], Tensor],
+    schedule: LRScheduler,
+    clip: float | None = None,
+) -> Iterator[int]:
+    """Train a network in place by the optimizer of a schedule; yields how many batches are done.
+
+    `clip` is the largest norm of the gradient of all weights; None: any.
+    """
+    for done, batch in enumerate(batches, start=1):
         network.train()
-        optimizer.zero_grad()
-        scores = network(torch.from_numpy(features).to(where))
-        measure(scores, torch.from_numpy(classes).to(where)).backward()
-        optimizer.step()
+        schedule.optimizer.zero_grad()
+        torch.autograd.backward(loss_of(batch))
+        if clip is not None:
+            nn.utils.clip_grad_norm_(network.parameters(), clip)
+        schedule.optimizer.step()
         schedule.step()
         yield done
 
@@ -189,18 +255,17 @@ def shuffled_batches(
     features: Floats, classes: IntArray, size: int, rng: np.random.Generator
 ) -> Iterator[Batch]:
     """Yield batches without end, in a new random order each epoch."""
-    while True:
-        yield from epoch(features, classes, min(size, len(features)), rng)
-
-
-def epoch(
-    features: Floats, classes: IntArray, size: int, rng: np.random.Generator
-) -> Iterator[Batch]:
-    """Yield the full batches of one epoch in random order."""
-    order = rng.permutation(len(features))
-    for first in range(0, len(order) - size + 1, size):
-        chosen = order[first : first + size]
+    for chosen in shuffled(len(features), size, rng):
         yield features[chosen], classes[chosen]
+
+
+def shuffled(runs: int, size: int, rng: np.random.Generator) -> Iterator[IntArray]:
+    """Yield the runs of full batches without end, in a new random order each epoch."""
+    size = min(size, runs)
+    while True:
+        order: IntArray = rng.permutation(runs)
+        for first in range(0, runs - size + 1, size):
+            yield order[first : first + size]
 
 
 @dataclass(frozen=True)

@@ -259,7 +259,7 @@ def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
     sets = _standardised_sets(folder / f"{job.features}.npz", rng)
     channels = sets["test"][0].shape[2]
     torch.manual_seed(int(rng.integers(2**31)))
-    network = networks.build_network("lstm", networks.Shape(channels, classes))
+    network = networks.build_network("lstm", channels, classes)
     batches = networks.shuffled_batches(*sets["training"], BATCH_RUNS, rng)
     accuracies: dict[str, tuple[float, ...]] = dict.fromkeys(sets, ())
     confusion = np.zeros((classes, classes), dtype=np.int64)

@@ -22,11 +22,7 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import load_run_set, replacing, save_run_set, write_text
 from failuretwin.decision.benchmark.tasks import PREFIXES_S, TASKS, Judgement
 from failuretwin.decision.evaluation import Truths, compare, evaluate
-from failuretwin.decision.learned.feature_encoder import (
-    FeatureEncoder,
-    expectation_of,
-    signals_of,
-)
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, signals_of
 from failuretwin.decision.learned.paper_study import (
     WORK,
     Exam,
@@ -82,10 +78,9 @@ def make_rival_data(plan: RivalPlan, robot: Robot, exam: Exam, folder: Path) -> 
     data = PopulationData((known,), modes, plan.seed, widening=(WIDER,))
     imperfect = data.run_set(0, plan.runs_per_class * len(names))
     save_run_set(imperfect, folder / LEARNT)
-    expected = expectation_of(robot, known.imperfections)
     made = {
         PUBLISHED: (FeatureEncoder("augmented", robot), published),
-        IMPERFECT: (FeatureEncoder("robust", robot, expected), imperfect),
+        IMPERFECT: (FeatureEncoder("robust", robot, known.imperfections), imperfect),
     }
     for twin, (coder, runs) in made.items():
         with replacing(folder / f"{twin}.npz") as new, new.open("wb") as file:

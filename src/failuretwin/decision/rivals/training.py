@@ -166,12 +166,10 @@ class _Trainer:
         import torch
 
         from failuretwin.decision.learned import networks as own
-        from failuretwin.decision.rivals import networks as other
 
-        shape = own.Shape(learn[0].shape[2], classes)
         torch.manual_seed(int(self.rng.integers(2**31)))
-        own_kind = self.job.method in NETWORKS
-        network = other.build(self.job.method if own_kind else "cnn", shape)
+        kind = self.job.method if self.job.method in NETWORKS else "cnn"
+        network = own.build_network(kind, learn[0].shape[2], classes)
         return network, own.shuffled_batches(*learn, BATCH_RUNS, self.rng)
 
     def fine_tuned(self, network: Any, target: Floats, truth: IntArray) -> Answer:
