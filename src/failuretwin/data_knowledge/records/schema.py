@@ -8,6 +8,7 @@ Section: docs/store.md#tables
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any
 
@@ -60,77 +61,70 @@ def storable(text: str) -> str:
     return text.encode("utf-8", "replace").decode().replace("\0", "\ufffd")
 
 
-def _key() -> sa.Column[int]:
-    return sa.Column("id", Id, primary_key=True)
-
-
-def _of(table: str, name: str = "", needed: bool = True) -> sa.Column[int]:
-    column = name or f"{table.removesuffix('s')}_id"
-    return sa.Column(column, Id, sa.ForeignKey(f"{table}.id"), nullable=not needed)
-
-
-def _needed(name: str, kind: Any) -> sa.Column[Any]:
-    return sa.Column(name, kind, nullable=False)
-
-
 metadata = sa.MetaData()
 
-robots = sa.Table(
-    "robots", metadata, _key(), sa.Column("name", Text, nullable=False, unique=True),
-    _needed("added", Utc),
-)  # fmt: skip
+
+def _table(name: str, *columns: sa.schema.SchemaItem) -> sa.Table:
+    """Return a table whose rows have a number."""
+    return sa.Table(name, metadata, sa.Column("id", Id, primary_key=True), *columns)
+
+
+def _of(
+    table: str, name: str = "", needed: bool = True, index: bool | None = None
+) -> sa.Column[int]:
+    """Return a column of rows of another table."""
+    column = name or f"{table.removesuffix('s')}_id"
+    return sa.Column(column, Id, sa.ForeignKey(f"{table}.id"), nullable=not needed, index=index)
+
+
+def _needed(kind: Any, *names: str) -> Iterator[sa.Column[Any]]:
+    """Yield columns of one kind that each row fills."""
+    return (sa.Column(name, kind, nullable=False) for name in names)
+
+
+def _may_lack(kind: Any, *names: str) -> Iterator[sa.Column[Any]]:
+    """Yield columns of one kind that a row may leave empty."""
+    return (sa.Column(name, kind) for name in names)
+
+
+robots = _table(
+    "robots", sa.Column("name", Text, nullable=False, unique=True), *_needed(Utc, "added")
+)
 """One row a robot; its name is its own, not that of its kind."""
 
-profiles = sa.Table(
+profiles = _table(
     "profiles",
-    metadata,
-    _key(),
     _of("robots"),
-    _needed("name", Text),
-    _needed("arm_class", Text),
-    _needed("document", Text),
-    _needed("sha256", Text),
-    _needed("added", Utc),
+    *_needed(Text, "name", "arm_class", "document", "sha256"),
+    *_needed(Utc, "added"),
     sa.UniqueConstraint("robot_id", "sha256"),
 )
 """Profiles of a robot, as text; the last one is in force."""
 
-sensors = sa.Table(
+sensors = _table(
     "sensors",
-    metadata,
-    _key(),
-    sa.Column("profile_id", Id, sa.ForeignKey("profiles.id"), nullable=False, index=True),
-    _needed("kind", Text),
-    _needed("details", Json),
+    _of("profiles", index=True),
+    *_needed(Text, "kind"),
+    *_needed(Json, "details"),
 )
 """Sensors that a profile states."""
 
-calibrations = sa.Table(
+calibrations = _table(
     "calibrations",
-    metadata,
-    _key(),
     _of("robots"),
-    _needed("name", Text),
-    _needed("protocol", Text),
-    _needed("document", Text),
-    _needed("sha256", Text),
-    _needed("version", Text),
-    _needed("valid_from", Utc),
-    sa.Column("valid_to", Utc),
+    *_needed(Text, "name", "protocol", "document", "sha256", "version"),
+    *_needed(Utc, "valid_from"),
+    *_may_lack(Utc, "valid_to"),
     sa.Index("ix_calibrations_robot", "robot_id", "valid_from"),
 )
 """Calibrations of a robot as TOML; `valid_to` is empty for the one in force."""
 
-sessions = sa.Table(
+sessions = _table(
     "sessions",
-    metadata,
-    _key(),
     _of("robots"),
     _of("calibrations", needed=False),
-    _needed("begun", Utc),
-    _needed("version", Text),
-    _needed("method", Text),
-    _needed("protocol", Text),
+    *_needed(Utc, "begun"),
+    *_needed(Text, "version", "method", "protocol"),
     sa.Column("command", Text, nullable=False, server_default="diagnose"),
     sa.Column("diagnosed", Json, nullable=False, server_default="{}"),
     sa.Index("ix_sessions_robot", "robot_id", "id"),
@@ -140,177 +134,135 @@ sessions = sa.Table(
 `diagnosed` counts by state all diagnoses of the robot up to this row, without those behind
 notes: a history need not count them."""
 
-logs = sa.Table(
+logs = _table(
     "logs",
-    metadata,
-    _key(),
     _of("robots"),
-    _needed("path", Text),
-    sa.Column("sha256", Text),
-    _needed("bytes", sa.BigInteger()),
-    _needed("recorded", Utc),
-    _needed("added", Utc),
+    *_needed(Text, "path"),
+    *_may_lack(Text, "sha256"),
+    *_needed(sa.BigInteger(), "bytes"),
+    *_needed(Utc, "recorded", "added"),
     sa.UniqueConstraint("robot_id", "sha256"),
 )
 """Logs by reference: the bulk stays in the file."""
 
-runs = sa.Table(
+runs = _table(
     "runs",
-    metadata,
-    _key(),
     _of("logs"),
-    _needed("position", sa.Integer()),
-    _needed("name", Text),
-    sa.Column("details", Json),
+    *_needed(sa.Integer(), "position"),
+    *_needed(Text, "name"),
+    *_may_lack(Json, "details"),
     sa.UniqueConstraint("log_id", "position", "name"),
 )
 """Runs of a log, in its order; details: duration [s], sensor rate [Hz]."""
 
-diagnoses = sa.Table(
+diagnoses = _table(
     "diagnoses",
-    metadata,
-    _key(),
     _of("sessions"),
-    sa.Column("run_id", Id, sa.ForeignKey("runs.id"), nullable=False, index=True),
+    _of("runs", index=True),
     _of("robots"),
-    _needed("at", Utc),
-    _needed("state", Text),
-    sa.Column("hypothesis", Text),
-    sa.Column("probability", sa.Double()),
-    _needed("posterior", Json),
-    sa.Column("onset_s", sa.Double()),
-    sa.Column("onset_low_s", sa.Double()),
-    sa.Column("onset_high_s", sa.Double()),
-    sa.Column("magnitude", sa.Double()),
-    sa.Column("magnitude_unit", Text),
-    sa.Column("magnitude_low", sa.Double()),
-    sa.Column("magnitude_high", sa.Double()),
-    _needed("verdict", Text),
-    _needed("undecided", Text),
-    _needed("quality", Json),
-    _needed("digest", Text),
+    *_needed(Utc, "at"),
+    *_needed(Text, "state"),
+    *_may_lack(Text, "hypothesis"),
+    *_may_lack(sa.Double(), "probability"),
+    *_needed(Json, "posterior"),
+    *_may_lack(sa.Double(), "onset_s", "onset_low_s", "onset_high_s", "magnitude"),
+    *_may_lack(Text, "magnitude_unit"),
+    *_may_lack(sa.Double(), "magnitude_low", "magnitude_high"),
+    *_needed(Text, "verdict", "undecided"),
+    *_needed(Json, "quality"),
+    *_needed(Text, "digest"),
     sa.Index("ix_diagnoses_robot", "robot_id", "at"),
 )
 """Diagnoses of runs; intervals hold 90 %, `magnitude` is in the unit of its fault mode."""
 
-episodes = sa.Table(
+episodes = _table(
     "episodes",
-    metadata,
-    _key(),
     _of("robots"),
-    _needed("number", sa.Integer()),
-    _needed("motor", Text),
-    _needed("mode", Text),
-    _needed("since", Utc),
-    sa.Column("until", Utc),
+    *_needed(sa.Integer(), "number"),
+    *_needed(Text, "motor", "mode"),
+    *_needed(Utc, "since"),
+    *_may_lack(Utc, "until"),
     sa.UniqueConstraint("robot_id", "number"),
 )
 """Fault episodes of a robot, numbered from 1; `until` is empty while the fault lasts."""
 
-episode_events = sa.Table(
+episode_events = _table(
     "episode_events",
-    metadata,
-    _key(),
-    sa.Column("episode_id", Id, sa.ForeignKey("episodes.id"), nullable=False, index=True),
+    _of("episodes", index=True),
     _of("diagnoses", "diagnosis_id"),
-    _needed("state", Text),
-    _needed("at", Utc),
+    *_needed(Text, "state"),
+    *_needed(Utc, "at"),
 )
 """Changes of the state of an episode, and the diagnosis behind each."""
 
-findings = sa.Table(
+findings = _table(
     "findings",
-    metadata,
-    _key(),
-    sa.Column("episode_id", Id, sa.ForeignKey("episodes.id"), nullable=False, index=True),
+    _of("episodes", index=True),
     _of("findings", "withdraws", needed=False),
-    _needed("verdict", Text),
-    _needed("cause", Text),
-    _needed("person", Text),
-    _needed("note", Text),
-    _needed("at", Utc),
+    *_needed(Text, "verdict", "cause", "person", "note"),
+    *_needed(Utc, "at"),
 )
 """What people found; a row with `withdraws` takes an earlier one back."""
 
-notes = sa.Table(
+notes = _table(
     "notes",
-    metadata,
-    _key(),
     _of("sessions"),
     _of("robots"),
-    sa.Column("diagnosis_id", Id, sa.ForeignKey("diagnoses.id"), index=True),
-    _needed("at", Utc),
-    _needed("text", Text),
+    _of("diagnoses", "diagnosis_id", needed=False, index=True),
+    *_needed(Utc, "at"),
+    *_needed(Text, "text"),
     sa.Index("ix_notes_robot", "robot_id", "at"),
 )
 """What happened in a session, a sentence each, and the diagnosis behind it."""
 
-offsets = sa.Table(
+offsets = _table(
     "offsets",
-    metadata,
-    _key(),
     _of("sessions"),
     _of("robots"),
-    _needed("at", Utc),
-    _needed("motor", Text),
-    _needed("name", Text),
-    _needed("value", sa.Double()),
-    _needed("deviation", sa.Double()),
-    _needed("unit", Text),
+    *_needed(Utc, "at"),
+    *_needed(Text, "motor", "name"),
+    *_needed(sa.Double(), "value", "deviation"),
+    *_needed(Text, "unit"),
     sa.Index("ix_offsets_robot", "robot_id", "at"),
 )
 """Offsets of the motors as a session found them: mean and standard deviation."""
 
-beliefs = sa.Table(
+beliefs = _table(
     "beliefs",
-    metadata,
-    _key(),
     _of("sessions"),
     _of("robots"),
-    _needed("follower", Text),
-    _needed("start", Text),
-    _needed("runs", sa.Integer()),
-    _needed("rows", Json),
-    _needed("arrays", sa.LargeBinary()),
+    *_needed(Text, "follower", "start"),
+    *_needed(sa.Integer(), "runs"),
+    *_needed(Json, "rows"),
+    *_needed(sa.LargeBinary(), "arrays"),
     sa.Index("ix_beliefs_robot", "robot_id", "follower"),
 )
 """Posterior of theta of a robot after a session, its new runs, and the start of it all."""
 
-residuals = sa.Table(
+residuals = _table(
     "residuals",
-    metadata,
-    _key(),
-    sa.Column("diagnosis_id", Id, sa.ForeignKey("diagnoses.id"), nullable=False, index=True),
+    _of("diagnoses", "diagnosis_id", index=True),
     _of("robots"),
-    _needed("at", Utc),
-    _needed("motor", Text),
-    _needed("unit", Text),
-    _needed("movements", Json),
+    *_needed(Utc, "at"),
+    *_needed(Text, "motor", "unit"),
+    *_needed(Json, "movements"),
 )
 """Displacements of a motor where `unknown` is most probable, a list a quantity; see
 `core.hypothesis.MotorResidual`."""
 
-repairs = sa.Table(
+repairs = _table(
     "repairs",
-    metadata,
-    _key(),
-    sa.Column("robot_id", Id, sa.ForeignKey("robots.id"), nullable=False, index=True),
-    _needed("motor", Text),
-    _needed("part", Text),
-    _needed("person", Text),
-    _needed("note", Text),
-    _needed("at", Utc),
+    _of("robots", index=True),
+    *_needed(Text, "motor", "part", "person", "note"),
+    *_needed(Utc, "at"),
 )
 """Repairs and replaced parts."""
 
-withdrawals = sa.Table(
+withdrawals = _table(
     "withdrawals",
-    metadata,
-    _key(),
     _of("repairs"),
-    _needed("person", Text),
-    _needed("note", Text),
-    _needed("at", Utc),
+    *_needed(Text, "person", "note"),
+    *_needed(Utc, "at"),
 )
 """Repairs that somebody took back; both rows stay."""
 
