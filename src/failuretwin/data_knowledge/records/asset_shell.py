@@ -69,8 +69,11 @@ def _shell(history: History) -> tuple[model.AssetAdministrationShell, list[model
 
     name = quote(history.robot, safe="")
     asset = f"{URN}:robot:{name}"
-    contents = {
-        "Nameplate": _nameplate(history, asset),
+    contents: dict[str, Content] = {
+        "Nameplate": {
+            "URIOfTheProduct": asset,
+            "ManufacturerProductDesignation": history.kind or None,
+        },
         "Calibration": _calibration(history),
         "Health": _health(history),
         "FaultHistory": _faults(history),
@@ -102,11 +105,10 @@ def _shell(history: History) -> tuple[model.AssetAdministrationShell, list[model
 # Contents of the submodels.
 
 
-def _nameplate(history: History, asset: str) -> Content:
-    return {
-        "URIOfTheProduct": asset,
-        "ManufacturerProductDesignation": history.kind or None,
-    }
+def _fields(value: Any, *names: str) -> dict[str, Any]:
+    """Return attributes of a value as elements, whose names are those in camel case."""
+    camel = {name: "".join(map(str.capitalize, name.split("_"))) for name in names}
+    return {camel[name]: getattr(value, name) for name in names}
 
 
 def _calibration(history: History) -> Content:
@@ -114,18 +116,12 @@ def _calibration(history: History) -> Content:
     found = next((one for one in history.calibrations if one.valid_to is None), None)
     if found is None:
         return {}
-    return {
-        "Number": found.number,
-        "Name": found.name,
-        "Protocol": found.protocol,
-        "ValidFrom": found.valid_from,
-        "Document": found.document.encode(),
-    }
+    stated = _fields(found, "number", "name", "protocol", "valid_from")
+    return {**stated, "Document": found.document.encode()}
 
 
 def _health(history: History) -> Content:
     """Return the state of the robot: sentence, counts, last diagnosis, last offsets [unit]."""
-    last = history.recent[-1] if history.recent else None
     content: dict[str, Any] = {
         "Summary": history.health,
         "OpenFaults": len(history.open_episodes),
@@ -134,9 +130,7 @@ def _health(history: History) -> Content:
         ],
         "Offsets": [
             {
-                "Motor": one.motor,
-                "Name": one.name,
-                "Unit": one.unit,
+                **_fields(one, "motor", "name", "unit"),
                 "At": one.at[-1],
                 "Mean": one.values[-1],
                 "Deviation": one.deviations[-1],
@@ -144,51 +138,24 @@ def _health(history: History) -> Content:
             for one in history.drifts
         ],
     }
-    if last is not None:
-        content["LastDiagnosis"] = {
-            "At": last.at,
-            "Run": last.run,
-            "State": last.state,
-            "Verdict": last.verdict,
-        }
+    for last in history.recent[-1:]:
+        content["LastDiagnosis"] = _fields(last, "at", "run", "state", "verdict")
     return content
 
 
 def _faults(history: History) -> Content:
+    repaired = ("at", "motor", "part", "person", "note")
     return {
         "Episodes": [_episode(one) for one in history.episodes],
-        "Repairs": [
-            {
-                "At": one.at,
-                "Motor": one.motor,
-                "Part": one.part,
-                "Person": one.person,
-                "Note": one.note,
-            }
-            for one in history.repairs
-        ],
+        "Repairs": [_fields(one, *repaired) for one in history.repairs],
     }
 
 
 def _episode(episode: FaultEpisode) -> Content:
+    found = ("at", "verdict", "cause", "person", "note", "withdrawn_when")
     return {
-        "Number": episode.number,
-        "Motor": episode.motor,
-        "Mode": episode.mode,
-        "State": episode.state,
-        "Since": episode.since,
-        "Until": episode.until,
-        "Findings": [
-            {
-                "At": one.at,
-                "Verdict": one.verdict,
-                "Cause": one.cause,
-                "Person": one.person,
-                "Note": one.note,
-                "WithdrawnWhen": one.withdrawn_when,
-            }
-            for one in episode.findings
-        ],
+        **_fields(episode, "number", "motor", "mode", "state", "since", "until"),
+        "Findings": [_fields(one, *found) for one in episode.findings],
     }
 
 

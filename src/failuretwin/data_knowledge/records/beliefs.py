@@ -43,34 +43,18 @@ class Belief:
     Attributes:
         runs: Number of runs that it has learned from.
         arrays: The state, by name.
-        rows: What is kept of each new run, the oldest first.
-        after: Number of the belief that it goes on from; None: the line is new.
+        rows: What is kept of runs, the oldest first: of all of its line if it was read from the
+            store, of the new ones if it is to be stored.
+        number: Number of the last belief of its line in the store; None: the line is new.
     """
 
     runs: int
     arrays: Arrays
     rows: Sequence[Mapping[str, Any]]
-    after: int | None = None
+    number: int | None = None
 
 
-@dataclass(frozen=True)
-class StoredBelief:
-    """A belief of the store.
-
-    Attributes:
-        number: Its number in the store.
-        runs: Number of runs that it has learned from.
-        arrays: The state, by name.
-        rows: What is kept of each run of its line, the oldest first.
-    """
-
-    number: int
-    runs: int
-    arrays: Arrays
-    rows: tuple[dict[str, Any], ...]
-
-
-def read_belief(connection: sa.Connection, robot: int, line: BeliefLine) -> StoredBelief | None:
+def read_belief(connection: sa.Connection, robot: int, line: BeliefLine) -> Belief | None:
     """Return the last belief of a line; None: the line is new.
 
     Raises:
@@ -81,7 +65,7 @@ def read_belief(connection: sa.Connection, robot: int, line: BeliefLine) -> Stor
     if found is None:
         return None
     rows = _rows_of(connection, _of(robot, line, __version__))
-    return StoredBelief(found.id, found.runs, _unpacked(found.arrays), rows)
+    return Belief(found.runs, _unpacked(found.arrays), rows, found.id)
 
 
 def _of(robot: int, line: BeliefLine, version: str) -> sa.ColumnElement[bool]:
@@ -138,7 +122,7 @@ def add_belief(
         .join(sessions)
         .where(_of(rows.robot, line, __version__))
     )
-    if connection.scalar(last) != belief.after:
+    if connection.scalar(last) != belief.number:
         raise OutputError(
             "another session has followed this robot since its belief was read. Nothing of this "
             "was stored. Run the command again."

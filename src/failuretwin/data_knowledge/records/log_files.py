@@ -10,8 +10,6 @@ from pathlib import Path
 
 from failuretwin.core.errors import InputError, reason
 
-CHUNK = 1 << 20
-
 
 @dataclass(frozen=True)
 class LogFile:
@@ -64,11 +62,8 @@ def _checksum(path: Path, files: list[Path]) -> str:
 
 
 def _sha256(file: Path) -> str:
-    digest = hashlib.sha256()
     with file.open("rb") as stream:
-        while chunk := stream.read(CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def utc(time: datetime) -> datetime:

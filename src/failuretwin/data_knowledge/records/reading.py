@@ -10,8 +10,8 @@ import sqlalchemy as sa
 from failuretwin.data_knowledge.records import CHECK_DAYS, writing
 from failuretwin.data_knowledge.records.asset_shell import export_shell
 from failuretwin.data_knowledge.records.beliefs import (
+    Belief,
     BeliefLine,
-    StoredBelief,
     latest_rows,
     other_line,
     read_belief,
@@ -61,7 +61,7 @@ class StoreReader:
             row = _row_of(connection, robot)
             return None if row is None else calibration_in_force(connection, row)
 
-    def belief(self, robot: str, line: BeliefLine) -> tuple[StoredBelief | None, str]:
+    def belief(self, robot: str, line: BeliefLine) -> tuple[Belief | None, str]:
         """Return the last belief of a line, and why that of another line is not used.
 
         Raises:
