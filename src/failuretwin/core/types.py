@@ -12,7 +12,7 @@ Indexing, writing, dropping and saving apply to every array of a value and of th
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Self, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -115,15 +115,20 @@ class ArrayStruct:
 
     def extended_by(self, *others: Self) -> Self:
         """Return these movements with those of others behind them, all of the same runs."""
-        each = zip(*(part._arrays() for part in (self, *others)), strict=True)
+        return self.joined([self, *others], "movement")
 
-        def joined(array: np.ndarray, axes: Axes) -> np.ndarray:
-            parts = [part for _, part, _ in next(each)]
-            if "movement" not in axes.names:
+    @classmethod
+    def joined(cls, parts: Sequence[Self], along: str = "run") -> Self:
+        """Return the entries of several values one after the other, by the name of their axis."""
+        each = zip(*(part._arrays() for part in parts), strict=True)
+
+        def one(array: np.ndarray, axes: Axes) -> np.ndarray:
+            arrays = [part for _, part, _ in next(each)]
+            if along not in axes.names:
                 return array
-            return np.concatenate(parts, axis=axes.names.index("movement"))
+            return np.concatenate(arrays, axis=axes.names.index(along))
 
-        return self._with(joined)
+        return parts[0]._with(one)
 
     def forget_oldest(self, runs: IntArray) -> None:
         """Drop the first movement of some runs; the last place becomes empty."""

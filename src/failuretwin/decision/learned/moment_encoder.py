@@ -12,15 +12,15 @@ of their deviation, so that arms of any size look alike.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray, IntArray
 from failuretwin.decision.learned.moment_features import MomentFeatures
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.inference.engine.moments import Moments, moments_of
@@ -39,40 +39,7 @@ BINS = PLATEAU_BINS + RAMP_BINS
 
 
 @dataclass(frozen=True)
-class RunArrays:
-    """Arrays of runs; the first axis of each is the run."""
-
-    def __len__(self) -> int:
-        """How many runs."""
-        return len(next(iter(self.arrays.values())))
-
-    def __getitem__(self, runs: NDArray[np.int64] | slice) -> Self:
-        """Return some runs."""
-        return self._each(lambda values: values[runs])
-
-    @property
-    def arrays(self) -> dict[str, Any]:
-        """All arrays, by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    def _each(self, change: Callable[[Any], Any]) -> Self:
-        """Return the same with every array changed."""
-        return replace(self, **{name: change(values) for name, values in self.arrays.items()})
-
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return the runs of several sets."""
-        found = {name: [part.arrays[name] for part in parts] for name in parts[0].arrays}
-        return cls(**{name: _joined(values) for name, values in found.items()})
-
-
-def _joined(values: Sequence[Any]) -> Any:
-    first = values[0]
-    return (first.joined if isinstance(first, RunArrays) else np.concatenate)(values)
-
-
-@dataclass(frozen=True)
-class Tokens(RunArrays):
+class Tokens(ArrayStruct):
     """Runs as the network takes them.
 
     Attributes:
@@ -83,10 +50,14 @@ class Tokens(RunArrays):
         edges: Times between the bins of the onset, (run, moment, motor, bin + 1) [s].
     """
 
-    features: Floats
-    exists: BoolArray
-    anchor: Floats
-    edges: Floats
+    features: Annotated[Floats, Axes("run", "moment", "motor", "feature")]
+    exists: Annotated[BoolArray, Axes("run", "moment", empty=False)]
+    anchor: Annotated[Floats, Axes("run", "moment", "motor", "part")]
+    edges: Annotated[Floats, Axes("run", "moment", "motor", "edge")]
+
+    def __len__(self) -> int:
+        """How many runs."""
+        return len(self.exists)
 
     @property
     def lengths(self) -> IntArray:
@@ -96,22 +67,21 @@ class Tokens(RunArrays):
     def cut(self) -> Tokens:
         """Return the same without room that no run needs."""
         most = int(self.lengths.max(initial=1))
-        return self._each(lambda values: values[:, :most])
+        return self._with(lambda values, axes: values[:, :most])
 
     def padded(self, moments: int) -> Tokens:
         """Return the same with room for so many moments."""
         more = moments - self.exists.shape[1]
         if more <= 0:
             return self
-        return self._each(
-            lambda values: np.pad(values, [(0, 0), (0, more)] + [(0, 0)] * (values.ndim - 2))
-        )
+        room = [(0, 0), (0, more), (0, 0), (0, 0)]
+        return self._with(lambda values, axes: np.pad(values, room[: values.ndim]))
 
     @classmethod
-    def joined(cls, parts: Sequence[Tokens]) -> Tokens:
+    def joined(cls, parts: Sequence[Tokens], along: str = "run") -> Tokens:
         """Return the runs of several sets, the shorter ones padded."""
         most = max(part.exists.shape[1] for part in parts)
-        return super().joined([part.padded(most) for part in parts])
+        return super().joined([part.padded(most) for part in parts], along)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
@@ -28,8 +28,8 @@ from torch.optim.lr_scheduler import OneCycleLR
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.core.types import FloatArray, IntArray, as_floats
-from failuretwin.decision.learned.moment_encoder import BINS, RunArrays, Tokens
+from failuretwin.core.types import ArrayStruct, Axes, FloatArray, IntArray, as_floats
+from failuretwin.decision.learned.moment_encoder import BINS, Tokens
 from failuretwin.decision.learned.moment_features import FEATURES
 from failuretwin.decision.learned.networks import DROPOUT, descent
 
@@ -145,7 +145,7 @@ LOG_SIZE_SCALE = 0.3
 
 
 @dataclass(frozen=True)
-class Labels(RunArrays):
+class Labels(ArrayStruct):
     """Truth of runs.
 
     Attributes:
@@ -155,10 +155,10 @@ class Labels(RunArrays):
         size: In the unit of the mode, (run,); NaN if healthy.
     """
 
-    motor: IntArray
-    mode: IntArray
-    onset: FloatArray
-    size: FloatArray
+    motor: Annotated[IntArray, Axes("run")]
+    mode: Annotated[IntArray, Axes("run")]
+    onset: Annotated[FloatArray, Axes("run")]
+    size: Annotated[FloatArray, Axes("run")]
 
     @classmethod
     def of_runs(
@@ -190,7 +190,7 @@ class Labels(RunArrays):
 
 
 @dataclass(frozen=True)
-class Batch(RunArrays):
+class Batch(ArrayStruct):
     """Some runs with their truth, as arrays.
 
     Attributes:
@@ -204,12 +204,16 @@ class Batch(RunArrays):
     """
 
     tokens: Tokens
-    motor: IntArray
-    mode: IntArray
-    row: IntArray
-    bin: IntArray
-    size: NDArray[np.float32]
-    angle: NDArray[np.bool_]
+    motor: Annotated[IntArray, Axes("run")]
+    mode: Annotated[IntArray, Axes("run")]
+    row: Annotated[IntArray, Axes("run")]
+    bin: Annotated[IntArray, Axes("run")]
+    size: Annotated[NDArray[np.float32], Axes("run")]
+    angle: Annotated[NDArray[np.bool_], Axes("run")]
+
+    def __len__(self) -> int:
+        """How many runs."""
+        return len(self.tokens)
 
     def cut(self) -> Batch:
         """Return the same without room that no run needs."""
