@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import json
 import platform
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import Any
 from failuretwin import __version__
 from failuretwin.core.config import fingerprint
 from failuretwin.core.errors import FailureTwinError, InputError, OutputError, reason
-from failuretwin.data_knowledge.store import sole_writer
+from failuretwin.data_knowledge.store import atomic_replace, sole_writer
 from failuretwin.data_knowledge.workers import Workforce
 
 DECISIVE = ("numpy", "scipy", "zarr", "numcodecs")
@@ -52,6 +52,11 @@ class Unfinished(ABC):
     @abstractmethod
     def make(self, piece: int) -> str:
         """Make a piece and write it, in any process; return its hash."""
+
+    @property
+    def unit(self) -> str:
+        """What the pieces consist of."""
+        return "runs"
 
     @abstractmethod
     def begin(self) -> None:
@@ -102,6 +107,91 @@ class Unfinished(ABC):
         marks = self.marks.glob("*")
         return sum(self.sizes[int(mark.name)] for mark in marks if mark.stat().st_size)
 
+    def carry_out(
+        self,
+        path: Path,
+        workforce: Workforce,
+        on_progress: Callable[[int], None],
+        tell: Callable[[str], None],
+    ) -> None:
+        """Make all missing pieces, and put the result in the place of `path`.
+
+        Other unfinished work for `path` is removed. If this fails, finished pieces are kept.
+
+        Args:
+            path: The result; `folder` is its `hidden_folder`.
+            workforce: Processes that do the work; the result does not depend on them.
+            on_progress: Called with the number of further runs that are finished.
+            tell: Called with one line about an earlier attempt, or about this one if it fails.
+
+        Raises:
+            InputError: If the workforce cannot be had or cannot do the work.
+            OutputError: If the result cannot be written, or another process is writing it.
+        """
+        target = path.resolve()
+        try:
+            with sole_writer(target):
+                self._remove_others(target)
+                try:
+                    self.begin()
+                    self.finish(self._make_missing(workforce, on_progress, tell), target)
+                except BaseException:
+                    self._keep_finished(tell)
+                    raise
+        except OSError as error:
+            if isinstance(error, FailureTwinError):
+                raise
+            raise OutputError(
+                f"{path}: could not be written ({reason(error)}). Free some space or choose "
+                "another place."
+            ) from error
+
+    def _remove_others(self, path: Path) -> None:
+        for other in path.parent.glob(f".{glob.escape(path.name)}.{'[0-9a-f]' * 16}.partial"):
+            if other != self.folder:
+                shutil.rmtree(other)
+
+    def _keep_finished(self, tell: Callable[[str], None]) -> None:
+        """Say what is kept of unfinished work; remove it if that is nothing."""
+        kept = self.kept()
+        if not kept:
+            self.remove()
+            return
+        tell(
+            f"{kept} of {sum(self.sizes)} {self.unit} are kept in {self.folder}; the same command "
+            "goes on from there"
+        )
+
+    def _make_missing(
+        self,
+        workforce: Workforce,
+        on_progress: Callable[[int], None],
+        tell: Callable[[str], None],
+    ) -> str:
+        """Make every piece that is missing; return the hash of all."""
+        digests, sizes = self.finished(), self.sizes
+        kept = sum(sizes[piece] for piece in digests)
+        if kept:
+            tell(f"continuing: {kept} of {sum(sizes)} {self.unit} were there")
+            on_progress(kept)
+        missing = [piece for piece in range(len(sizes)) if piece not in digests]
+        if missing:
+            with workforce.map(self.make, missing) as made:
+                for piece, digest in zip(missing, made, strict=True):
+                    digests[piece] = digest
+                    on_progress(sizes[piece])
+        whole = "".join(digests[piece] for piece in range(len(sizes)))
+        return hashlib.sha256(whole.encode()).hexdigest()
+
+    def publish(self, result: Path, manifest: Mapping[str, Any], name: str, path: Path) -> None:
+        """Put a folder with its manifest, a file of some name, in the place of `path`."""
+        for torn in result.rglob("*.partial"):  # of a process that was killed as it wrote
+            torn.unlink()
+        text = json.dumps(manifest, indent=2, sort_keys=True) + "\n"
+        (result / name).write_bytes(text.encode())
+        atomic_replace(result, path)
+        self.remove()
+
     def check_worker(self) -> None:
         """Raise InputError if this process has other versions, or cannot see the folder."""
         own = versions(*self.versions.keys() - {"failuretwin"})
@@ -121,98 +211,10 @@ class Unfinished(ABC):
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def carry_out(
-    start: Callable[[Path], Unfinished],
-    path: Path,
-    manifest: Mapping[str, Any],
-    workforce: Workforce,
-    on_progress: Callable[[int], None],
-    tell: Callable[[str], None],
-    unit: str = "runs",
-) -> None:
-    """Make all missing pieces of some work, and put the result in the place of `path`.
-
-    Args:
-        start: Returns the work, given its hidden folder.
-        path: The result.
-        manifest: All that decides what the result is.
-        workforce: Processes that do the work; the result does not depend on them.
-        on_progress: Called with the number of further runs that are finished.
-        tell: Called with one line about an earlier attempt, or about this one if it fails.
-        unit: What the pieces consist of.
-
-    Raises:
-        InputError: If the workforce cannot be had or cannot do the work.
-        OutputError: If the result cannot be written, or another process is writing it.
-    """
+def hidden_folder(path: Path, manifest: Mapping[str, Any]) -> Path:
+    """Return the folder of unfinished work for `path`, by all that decides what the result is."""
     target = path.resolve()  # a link stays a link
-    try:
-        with sole_writer(target), _unfinished(start, target, manifest, tell, unit) as unfinished:
-            content = _make_missing(unfinished, workforce, on_progress, tell, unit)
-            unfinished.finish(content, target)
-    except OSError as error:
-        if isinstance(error, FailureTwinError):
-            raise
-        raise OutputError(
-            f"{path}: could not be written ({reason(error)}). Free some space or choose another "
-            "place."
-        ) from error
-
-
-@contextmanager
-def _unfinished(
-    start: Callable[[Path], Unfinished],
-    path: Path,
-    manifest: Mapping[str, Any],
-    tell: Callable[[str], None],
-    unit: str,
-) -> Iterator[Unfinished]:
-    """Give the unfinished work for `path`, new or as an earlier attempt left it.
-
-    Other unfinished work for `path` is removed. If the block fails, finished pieces are kept.
-    """
-    first, last = f".{path.name}.", ".partial"
-    folder = path.with_name(first + fingerprint(manifest)[:16] + last)
-    for other in path.parent.glob(f"{glob.escape(first)}{'[0-9a-f]' * 16}{last}"):
-        if other != folder:
-            shutil.rmtree(other)
-    unfinished = start(folder)
-    try:
-        unfinished.begin()
-        yield unfinished
-    except BaseException:
-        kept = unfinished.kept()
-        if kept:
-            tell(
-                f"{kept} of {sum(unfinished.sizes)} {unit} are kept in {folder}; the same command "
-                "goes on from there"
-            )
-        else:
-            unfinished.remove()
-        raise
-
-
-def _make_missing(
-    unfinished: Unfinished,
-    workforce: Workforce,
-    on_progress: Callable[[int], None],
-    tell: Callable[[str], None],
-    unit: str,
-) -> str:
-    """Make every piece that is missing; return the hash of all."""
-    digests, sizes = unfinished.finished(), unfinished.sizes
-    kept = sum(sizes[piece] for piece in digests)
-    if kept:
-        tell(f"continuing: {kept} of {sum(sizes)} {unit} were there")
-        on_progress(kept)
-    missing = [piece for piece in range(len(sizes)) if piece not in digests]
-    if missing:
-        with workforce.map(unfinished.make, missing) as made:
-            for piece, digest in zip(missing, made, strict=True):
-                digests[piece] = digest
-                on_progress(sizes[piece])
-    whole = "".join(digests[piece] for piece in range(len(sizes)))
-    return hashlib.sha256(whole.encode()).hexdigest()
+    return target.with_name(f".{target.name}.{fingerprint(manifest)[:16]}.partial")
 
 
 def versions(*packages: str) -> dict[str, str]:

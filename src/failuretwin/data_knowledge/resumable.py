@@ -6,7 +6,6 @@ are the same for any number of workers. Interrupted work is continued.
 
 from __future__ import annotations
 
-import json
 import platform
 import shutil
 from collections.abc import Callable
@@ -17,9 +16,8 @@ from typing import TYPE_CHECKING, Any
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import VARIABLES
 from failuretwin.data_knowledge.generate import CHUNK_RUNS, Plan, simulate, simulate_runs
-from failuretwin.data_knowledge.pieces import Unfinished, carry_out, versions
+from failuretwin.data_knowledge.pieces import Unfinished, hidden_folder, versions
 from failuretwin.data_knowledge.store import (
-    atomic_replace,
     check_destination,
     save_run_set,
     writing_zarr,
@@ -71,14 +69,9 @@ def produce(
         _check_fits_memory(plan, path)
         save_run_set(simulate(plan, workforce.workers, on_progress, workforce.scheduler), path)
         return
-    carry_out(
-        lambda folder: UnfinishedRunSet(folder, versions(), plan, chunk_runs),
-        path,
-        _manifest(plan, chunk_runs),
-        workforce,
-        on_progress,
-        tell,
-    )
+    folder = hidden_folder(path, _manifest(plan, chunk_runs))
+    unfinished = UnfinishedRunSet(folder, versions(), plan, chunk_runs)
+    unfinished.carry_out(path, workforce, on_progress, tell)
 
 
 def _check_fits_memory(plan: Plan, path: Path) -> None:
@@ -172,14 +165,9 @@ class UnfinishedRunSet(Unfinished):
 
     def finish(self, content: str, path: Path) -> None:
         """Make the store readable and put it in the place of `path`."""
-        for torn in self.store.rglob("*.partial"):  # of a process that was killed as it wrote
-            torn.unlink()
-        manifest = {**_manifest(self.plan, self.chunk_runs), "content": content}
-        text = json.dumps(manifest, indent=2, sort_keys=True) + "\n"
-        (self.store / MANIFEST).write_bytes(text.encode())
         shutil.copyfile(self.folder / GROUP, self.store / GROUP)
-        atomic_replace(self.store, path)
-        self.remove()
+        manifest = {**_manifest(self.plan, self.chunk_runs), "content": content}
+        self.publish(self.store, manifest, MANIFEST, path)
 
 
 def _manifest(plan: Plan, chunk_runs: int) -> dict[str, Any]:

@@ -16,10 +16,10 @@ from typing import Any
 from failuretwin.core.config import fingerprint
 from failuretwin.core.errors import OutputError
 from failuretwin.core.runs import unique_names
-from failuretwin.data_knowledge.pieces import Unfinished, carry_out, versions
+from failuretwin.data_knowledge.pieces import Unfinished, hidden_folder, versions
 from failuretwin.data_knowledge.readers.read import ReadOptions
 from failuretwin.data_knowledge.run_pieces import RunPieces
-from failuretwin.data_knowledge.store import atomic_replace, check_fillable
+from failuretwin.data_knowledge.store import check_fillable
 from failuretwin.data_knowledge.workers import Workforce
 from failuretwin.decision.results import (
     check_parquet,
@@ -78,33 +78,13 @@ def diagnose_to_parquet(
     if not isinstance(runs, RunPieces):
         sources = [runs] if isinstance(runs, str | Path) else runs
         runs = RunPieces([Path(source) for source in sources], bayes.twin.robot, ReadOptions())
-    _diagnose(runs, bayes, folder, correction, workforce, on_progress, tell)
-
-
-def _diagnose(
-    runs: RunPieces,
-    bayes: BayesDiagnoser,
-    folder: Path,
-    correction: LogCorrection | None,
-    workforce: Workforce,
-    on_progress: Callable[[int], None],
-    tell: Callable[[str], None],
-) -> None:
     manifest = _manifest(runs, bayes, correction)
     if _is_complete(folder, fingerprint(manifest), len(runs.pieces)):
         tell(f"{folder}: holds these results already")
         return
-    carry_out(
-        lambda hidden: UnfinishedResults(
-            hidden, versions(*PACKAGES), runs, bayes, correction, fingerprint(manifest)
-        ),
-        folder,
-        manifest,
-        workforce,
-        on_progress,
-        tell,
-        "runs" if all(piece.rows is not None for piece in runs.pieces) else "logs",
-    )
+    work = runs, bayes, correction, fingerprint(manifest)
+    unfinished = UnfinishedResults(hidden_folder(folder, manifest), versions(*PACKAGES), *work)
+    unfinished.carry_out(folder, workforce, on_progress, tell)
 
 
 def _check_results_folder(folder: Path) -> None:
@@ -167,6 +147,11 @@ class UnfinishedResults(Unfinished):
         """Number of runs, or of logs, in each piece."""
         return [piece.size for piece in self.runs.pieces]
 
+    @property
+    def unit(self) -> str:
+        """What the pieces consist of."""
+        return "runs" if all(piece.rows is not None for piece in self.runs.pieces) else "logs"
+
     def files(self, piece: int) -> list[Path]:
         """Return the file of a piece."""
         return [self.results / part_name(piece)]
@@ -219,13 +204,8 @@ class UnfinishedResults(Unfinished):
     def finish(self, content: str, path: Path) -> None:
         """Name runs uniquely, and put the folder in the place of `path`."""
         self._rename()
-        for torn in self.results.glob("*.partial"):  # of a process that was killed as it wrote
-            torn.unlink()
         stated = {"content": content, "identity": self.identity, "versions": self.versions}
-        text = json.dumps(stated, indent=2, sort_keys=True) + "\n"
-        (self.results / MANIFEST).write_bytes(text.encode())
-        atomic_replace(self.results, path)
-        self.remove()
+        self.publish(self.results, stated, MANIFEST, path)
 
     def _rename(self) -> None:
         """Number runs of the same name, as `read_runs` does."""
