@@ -15,8 +15,7 @@ from failuretwin.decision.benchmark.tasks import PREFIXES_S
 from failuretwin.decision.learned.feature_encoder import POINTS
 from failuretwin.decision.learned.paper_study import PLAN_FILE, WORK, StudyPlan, stand_in_test_set
 from failuretwin.decision.rivals import study
-from failuretwin.decision.rivals.plan import LATE, RivalJob, RivalPlan, rival_jobs
-from failuretwin.decision.rivals.training import folds
+from failuretwin.decision.rivals.training import LATE, RivalJob, RivalPlan, folds, rival_jobs
 from failuretwin.digital_model.twin import DigitalTwin
 
 TINY = RivalPlan(0, 4, 2, 1, 2)
@@ -82,7 +81,7 @@ def test_classifiers_separate_what_is_separate(name):
 
 def test_the_gradient_is_reversed():
     torch = pytest.importorskip("torch")
-    from failuretwin.decision.rivals.networks import _Reversed
+    from failuretwin.decision.learned.networks import _Reversed
 
     x = torch.ones(3, requires_grad=True)
     (_Reversed.apply(x, 0.5) * torch.tensor([1.0, 2.0, 3.0])).sum().backward()

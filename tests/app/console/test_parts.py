@@ -32,7 +32,7 @@ from failuretwin.connection.links.base import Order, Reading
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.readers.read import read_runs
-from failuretwin.data_knowledge.records.overview import RobotGlance
+from failuretwin.data_knowledge.records.queries import RobotGlance
 from failuretwin.data_knowledge.records.store import open_store
 from failuretwin.decision.acting.work import Halted
 from failuretwin.digital_model.calibrated_robot import calibrated

@@ -272,8 +272,8 @@ def _rivals(
     """Compare the rivals and write table and page."""
     from failuretwin.app.reports.study_page import rivals_table, write_rivals
     from failuretwin.decision.learned import paper_study as paper
-    from failuretwin.decision.rivals.plan import RivalPlan, quick_rivals, rival_jobs
     from failuretwin.decision.rivals.study import rival_scores, run_rivals
+    from failuretwin.decision.rivals.training import RivalPlan, quick_rivals, rival_jobs
 
     model, seed = robot.model, robot.seed
     plan = quick_rivals(seed) if quick else RivalPlan(seed)

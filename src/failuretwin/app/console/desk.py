@@ -29,7 +29,7 @@ from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.records.history import FaultEpisode
 from failuretwin.data_knowledge.records.log_files import log_file
-from failuretwin.data_knowledge.records.overview import RobotGlance, StoredRun
+from failuretwin.data_knowledge.records.queries import RobotGlance, StoredRun
 from failuretwin.data_knowledge.records.store import Store
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.robot import Robot, bundled_robots, load_robot

@@ -21,7 +21,7 @@ from failuretwin.connection.links.base import OK
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import printable
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.data_knowledge.records.overview import StoredRun
+from failuretwin.data_knowledge.records.queries import StoredRun
 from failuretwin.decision.acting.reach import Reach, reach, workspace
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics

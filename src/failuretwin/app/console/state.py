@@ -15,7 +15,7 @@ from failuretwin.core.foreign import printable
 from failuretwin.core.hypothesis import CLEAR, FAULTY_STATE, Alarm, Diagnosis, Hypothesis
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.records import CHECK_DAYS
-from failuretwin.data_knowledge.records.overview import RobotGlance
+from failuretwin.data_knowledge.records.queries import RobotGlance
 from failuretwin.decision.streaming.set_up_watch import is_held
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 from failuretwin.inference.explanation import plain_name, set_up_doubt

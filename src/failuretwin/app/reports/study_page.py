@@ -31,8 +31,8 @@ from failuretwin.decision.learned.paper_study import (
     ratio_spreads,
     spread_of,
 )
-from failuretwin.decision.rivals.plan import RivalPlan
 from failuretwin.decision.rivals.study import RivalScores
+from failuretwin.decision.rivals.training import RivalPlan
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 

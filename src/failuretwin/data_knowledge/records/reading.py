@@ -16,7 +16,6 @@ from failuretwin.data_knowledge.records.beliefs import (
     other_line,
     read_belief,
 )
-from failuretwin.data_knowledge.records.checking import StoreCheck, checked
 from failuretwin.data_knowledge.records.database import Database
 from failuretwin.data_knowledge.records.export import export_parquet
 from failuretwin.data_knowledge.records.fleet import (
@@ -26,13 +25,15 @@ from failuretwin.data_knowledge.records.fleet import (
     motor_ages,
 )
 from failuretwin.data_knowledge.records.history import History, StoredCalibration, read_history
-from failuretwin.data_knowledge.records.overview import (
+from failuretwin.data_knowledge.records.log_files import StoreCheck, checked
+from failuretwin.data_knowledge.records.queries import (
+    QueryAnswer,
     RobotGlance,
     StoredRun,
+    ask,
     read_overview,
     read_runs_of,
 )
-from failuretwin.data_knowledge.records.queries import QueryAnswer, ask
 from failuretwin.data_knowledge.records.schema import robots
 from failuretwin.data_knowledge.records.statements import calibration_in_force
 

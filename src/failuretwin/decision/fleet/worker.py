@@ -27,8 +27,7 @@ from failuretwin.connection.fleet.messages import ProfileMessage, parse_profile
 from failuretwin.core.errors import InputError, counted
 from failuretwin.decision.fleet.metrics import Metrics
 from failuretwin.decision.fleet.partition import PROFILE, AlarmChange, Envelope, Partition, Resolve
-from failuretwin.decision.fleet.snapshots import LeaseLostError, Snapshots
-from failuretwin.decision.fleet.source import MessageSource
+from failuretwin.decision.fleet.source import LeaseLostError, MessageSource, Snapshots
 
 if TYPE_CHECKING:
     from nats.js.kv import KeyValue

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -291,3 +291,54 @@ class Standard:
     def __call__(self, features: Floats) -> Floats:
         """Return standardised features."""
         return (features - self.mean) / self.spread
+
+
+# Adversarial adaptation to target runs without labels.
+
+
+class _Reversed(torch.autograd.Function):
+    """The identity, whose gradient has the other sign and another strength."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, strength: float) -> Tensor:
+        ctx.strength = strength
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return -ctx.strength * gradient, None
+
+
+def adversarial_training(
+    network: Cnn,
+    batches: Iterable[Batch],
+    target: Floats,
+    iterations: int,
+    learning_rate: float,
+    rng: np.random.Generator,
+) -> Iterator[int]:
+    """Train a CNN so that its features do not tell simulated from target runs (DANN).
+
+    Ganin et al., JMLR 2016: a second head, behind a reversed gradient, learns to tell them apart.
+    Its strength rises from 0 to 1 as 2 / (1 + exp(-10 p)) - 1. Target runs have no labels. The
+    learning rate falls to zero along half a cosine.
+    """
+    judge = nn.Sequential(nn.LazyLinear(WIDTH), nn.ReLU(), nn.Linear(WIDTH, 2))
+    measure, reverse = nn.CrossEntropyLoss(), cast("Any", _Reversed.apply)
+    judge(network.seen(torch.from_numpy(target[:2])))  # sets the size of the lazy layer
+    optimizer = torch.optim.Adam([*network.parameters(), *judge.parameters()], lr=learning_rate)
+    schedule = CosineAnnealingLR(optimizer, iterations)
+    others = shuffled_batches(target, np.zeros(len(target), dtype=np.int64), len(target), rng)
+
+    def loss_of(numbered: tuple[int, Batch]) -> Tensor:
+        done, (features, classes) = numbered
+        strength = 2.0 / (1.0 + float(np.exp(-10.0 * done / iterations))) - 1.0
+        simulated = network.seen(torch.from_numpy(features))
+        measured = network.seen(torch.from_numpy(next(others)[0][: len(features)]))
+        both: Tensor = reverse(torch.cat([simulated, measured]), strength)
+        origin = torch.cat([torch.zeros(len(simulated)), torch.ones(len(measured))]).long()
+        loss = measure(network.dense(simulated), torch.from_numpy(classes))
+        whole: Tensor = loss + measure(judge(both), origin)
+        return whole
+
+    return descent(network, enumerate(islice(batches, iterations), start=1), loss_of, schedule)

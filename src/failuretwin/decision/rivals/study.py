@@ -31,17 +31,20 @@ from failuretwin.decision.learned.paper_study import (
     spread,
 )
 from failuretwin.decision.results import read_results, write_json_lines
-from failuretwin.decision.rivals.plan import (
+from failuretwin.decision.rivals.training import (
     IMPERFECT,
     LATE,
+    LEARNT,
     MODELS,
     OWN,
     PUBLISHED,
+    Answer,
     RivalJob,
     RivalPlan,
+    by_own_network,
+    by_training,
     rival_jobs,
 )
-from failuretwin.decision.rivals.training import LEARNT, Answer, by_own_network, by_training
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.robot import Robot, load_robot

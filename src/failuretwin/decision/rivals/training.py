@@ -1,4 +1,4 @@
-"""Training of classifiers and networks on the runs of one twin, with one seed."""
+"""Plan of the study of rivals, and the training of one method on one twin with one seed."""
 
 from __future__ import annotations
 
@@ -21,12 +21,6 @@ from failuretwin.decision.learned.paper_study import (
     class_names,
     in_bfloat16,
 )
-from failuretwin.decision.rivals.plan import (
-    CLASSICAL,
-    NETWORKS,
-    RivalJob,
-    RivalPlan,
-)
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.robot import Robot
 
@@ -34,6 +28,82 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from failuretwin.decision.learned.networks import Batch
+
+PUBLISHED, IMPERFECT = TWINS = ("published", "imperfect")
+NETWORKS = ("lstm", "cnn", "tcn", "transformer")
+ADAPTING = {"dann": "P1", "fine-tuned": "P2"}
+"""CNNs that learn from target runs, with the protocol letter."""
+CLASSICAL = {
+    "minirocket": "MiniRocket",
+    "boosting": "GradientBoosting",
+    "nearest": "NearestSimulation",
+}
+OWN = "motorwise"
+"""Our network."""
+MODELS = ("kalman", "bayes", "self-calibrating", "hybrid")
+"""Methods without training, and the hybrid, which pools Bayes with our network of its seed."""
+LATE = ("fine-tuned", "hybrid")
+"""Methods that go on from a network of their seed."""
+
+
+@dataclass(frozen=True)
+class RivalPlan:
+    """Sizes of the study.
+
+    Attributes:
+        seed: Random seed.
+        runs_per_class: Simulated training runs of each class, for every method.
+        iterations: Batches of 32 runs, for every network.
+        repeats: Seeds.
+        stand_in_runs: Runs per class of the stand-in test set by the physics engine.
+    """
+
+    seed: int = 0
+    runs_per_class: int = 400
+    iterations: int = 3030
+    repeats: int = 5
+    stand_in_runs: int = 40
+
+
+def quick_rivals(seed: int) -> RivalPlan:
+    """Return a small study."""
+    return RivalPlan(seed, 40, 60, 1, 4)
+
+
+@dataclass(frozen=True)
+class RivalJob:
+    """One method, trained on runs of one twin with one seed."""
+
+    method: str
+    twin: str
+    repeat: int
+
+    @property
+    def name(self) -> str:
+        """Name of its file, without suffix."""
+        return f"{self.method}_{self.twin}_{self.repeat}"
+
+    @property
+    def protocol(self) -> str:
+        """Protocol letter; the imperfect twin was calibrated on healthy logs."""
+        if self.method == "self-calibrating":
+            return "P1"
+        return ADAPTING.get(self.method, "P0" if self.twin == PUBLISHED else "P0c")
+
+
+def rival_jobs(plan: RivalPlan) -> list[RivalJob]:
+    """Return all jobs; methods without chance have one, and those of one twin only that."""
+    jobs = []
+    for repeat in range(plan.repeats):
+        for twin in TWINS:
+            names = [*NETWORKS, OWN, *ADAPTING, *CLASSICAL, "hybrid"]
+            names += [m for m in MODELS if m != "hybrid" and repeat == 0]
+            one_twin = {OWN: IMPERFECT, "hybrid": IMPERFECT, "self-calibrating": PUBLISHED}
+            jobs += [RivalJob(n, twin, repeat) for n in names if one_twin.get(n, twin) == twin]
+    return jobs
+
+
+# One training.
 
 Answer = Callable[[int], FloatArray]
 """Returns logits or probabilities of the test runs in one of their views, (run, class)."""
@@ -134,7 +204,7 @@ class _Trainer:
 
     def trained(self, learn: Batch, target: Floats) -> Any:
         """Return a trained network, stored unless it adapts; fine-tuning goes on from the CNN."""
-        from failuretwin.decision.rivals.networks import adversarial_training
+        from failuretwin.decision.learned.networks import adversarial_training
 
         network, batches = self._new(learn, len(class_names(self.robot)))
         if self.job.method == "dann":
