@@ -219,16 +219,8 @@ CHUNK_RUNS = 100
 """Runs computed at a time: about 30 MB of work."""
 
 
-@dataclass(frozen=True)
-class _Draw:
-    """All chance of one run."""
-
-    movements: Movements
-    faults: tuple[FaultValue, ...]
-    chance: Disturbances
-
-
-def _draw(plan: Plan, run: int) -> _Draw:
+def _draw(plan: Plan, run: int) -> tuple[Movements, tuple[FaultValue, ...], Disturbances]:
+    """Return all chance of one run."""
     rng = np.random.default_rng([plan.seed, run])
     movements = plan.movements.draw(plan.robot, plan.imperfections.schedule, rng)
     duration = float(plan.time[-1])
@@ -237,15 +229,15 @@ def _draw(plan: Plan, run: int) -> _Draw:
         plan.modes[fault.mode].draw(fault.motor, plan.movements.count, duration, rng)
         for fault in plan.hypothesis_of(run).faults
     )
-    return _Draw(movements, faults, chance)
+    return movements, faults, chance
 
 
 def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     """Simulate some of a plan's runs, by their numbers (each below `plan.size`)."""
-    draws = [_draw(plan, run) for run in runs]
-    chance = stack([draw.chance for draw in draws])
-    commanded = delay_commands(stack_movements([draw.movements for draw in draws]), chance.late)
-    injection = Injection([draw.faults for draw in draws], plan.robot.motor_names, plan.modes)
+    movements, faults, chances = zip(*(_draw(plan, run) for run in runs), strict=True)
+    chance = stack(chances)
+    commanded = delay_commands(stack_movements(movements), chance.late)
+    injection = Injection(faults, plan.robot.motor_names, plan.modes)
     command, time = commanded.reference(plan.time), plan.time
     felt = chance
     if plan.engine == "physics":  # its gears have friction of their own
@@ -267,7 +259,7 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     seen = np.asarray(np.isfinite(measured).all(axis=-1))
     seeds = [[plan.seed, run] for run in runs]
     return RunTable(
-        run=[_run_name(plan, run) for run in runs],
+        run=[f"{plan.hypothesis_of(n)}/{n % plan.runs_per_class:05d}" for n in runs],
         motor=plan.robot.motor_names,
         time=time,
         command=command,
@@ -299,10 +291,6 @@ def _engine(plan: Plan) -> Engine:
     # Threads in the process that the user started; its workers are as many as there is room for.
     threads = (os.cpu_count() or 1) if parent_process() is None else 1
     return PhysicsEngine(plan.robot, threads=threads)
-
-
-def _run_name(plan: Plan, run: int) -> str:
-    return f"{plan.hypothesis_of(run)}/{run % plan.runs_per_class:05d}"
 
 
 def _truth(plan: Plan, runs: Sequence[int], faults: Sequence[Sequence[FaultValue]]) -> Truth:

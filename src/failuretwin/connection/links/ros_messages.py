@@ -24,7 +24,6 @@ from failuretwin.data_knowledge.readers.bag_messages import (
     BagMessage,
     Kind,
     Role,
-    ToolFrames,
     check_role,
     kind_of_type,
     topic_rows,
@@ -206,8 +205,8 @@ class RosReader:
             InputError: If it is invalid.
         """
         check_role(self._role, kind, f"{self._where}: {kind.value}")
-        message, frames = BagMessage(received_ns, content), ToolFrames.of(self._robot)
-        rows = topic_rows([message], kind, self._role, self._where, frames)
+        message = BagMessage(received_ns, content)
+        rows = topic_rows([message], kind, self._role, self._where, self._robot)
         if self._role != "tool":
             rows = motor_rows(rows, self._robot)
         self._check(rows.value, LARGEST)

@@ -66,25 +66,6 @@ GOAL_TOPIC = "/joint_goals"
 
 
 @dataclass(frozen=True)
-class ToolFrames:
-    """Which transform of a tree says where the tool is.
-
-    Attributes:
-        base: Frame of the robot's base.
-        tools: Frames of its tool, the first that there is counts.
-    """
-
-    base: str
-    tools: tuple[str, ...]
-
-    @classmethod
-    def of(cls, robot: Robot) -> ToolFrames:
-        """Return the frames of the profile, and those that drivers of industrial arms publish."""
-        profile = robot.profile
-        return cls(profile.base_link, ("tool0_controller", profile.tool_link, "tool0"))
-
-
-@dataclass(frozen=True)
 class BagTopics:
     """Which topics to read, where types and names of topics leave a choice.
 
@@ -186,7 +167,7 @@ class Rows:
 
 
 def topic_rows(
-    messages: Sequence[BagMessage], kind: Kind, role: Role, where: str, frames: ToolFrames
+    messages: Sequence[BagMessage], kind: Kind, role: Role, where: str, robot: Robot
 ) -> Rows:
     """Return the values in the messages of one topic; tool positions without a value are left out.
 
@@ -203,7 +184,7 @@ def topic_rows(
     elif kind is Kind.JOINT_STATE:
         parts = [_state_row(m, where) for m in messages if len(m.content.position)]
     elif kind is Kind.TRANSFORMS:
-        parts = _transforms(messages, where, frames)
+        parts = _transforms(messages, where, robot)
     else:
         rows = [_tool_row(m, kind, where) for m in messages]
         parts = [row for row in rows if np.isfinite(row.value).all()]
@@ -217,13 +198,18 @@ def _tool_row(message: BagMessage, kind: Kind, where: str) -> Rows:
     return Rows(where, _stamp(message), as_floats([[point.x, point.y, point.z]]), AXES)
 
 
-def _transforms(messages: Sequence[BagMessage], where: str, frames: ToolFrames) -> list[Rows]:
-    """Return where the tool is by the transforms from the base to the first of its frames."""
-    found: dict[str, list[Rows]] = {name: [] for name in frames.tools}
+def _transforms(messages: Sequence[BagMessage], where: str, robot: Robot) -> list[Rows]:
+    """Return where the tool is by the transforms from the base to the first of its frames.
+
+    These are the frame of the profile, and those that drivers of industrial arms publish.
+    """
+    base = robot.profile.base_link
+    tools = ("tool0_controller", robot.profile.tool_link, "tool0")
+    found: dict[str, list[Rows]] = {name: [] for name in tools}
     for message in messages:
         for one in message.content.transforms:
             child = one.child_frame_id.strip("/")
-            if one.header.frame_id.strip("/") == frames.base and child in found:
+            if one.header.frame_id.strip("/") == base and child in found:
                 at, stamp = one.transform.translation, _stamp(BagMessage(message.received_ns, one))
                 found[child].append(Rows(where, stamp, as_floats([[at.x, at.y, at.z]]), AXES))
     return next((rows for rows in found.values() if rows), [])

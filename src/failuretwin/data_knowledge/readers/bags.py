@@ -28,7 +28,6 @@ from failuretwin.data_knowledge.readers.bag_messages import (
     Kind,
     Role,
     Rows,
-    ToolFrames,
     check_role,
     topic_rows,
 )
@@ -183,8 +182,8 @@ class _Recording:
 
     def _read(self, topic: BagTopic, role: Role) -> Rows:
         kind = cast("Kind", topic.kind)  # one that fits the role
-        where, frames = f"{self.path}: topic {topic.name}", ToolFrames.of(self.robot)
-        return topic_rows(self.messages[topic.name], kind, role, where, frames)
+        where = f"{self.path}: topic {topic.name}"
+        return topic_rows(self.messages[topic.name], kind, role, where, self.robot)
 
     def _is_ours(self, topic: BagTopic, rows: Rows, role: Role) -> bool:
         """Return whether a topic tells of this robot; transforms may be of anything."""

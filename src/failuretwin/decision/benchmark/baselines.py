@@ -13,6 +13,7 @@ from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
 from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.decision.benchmark.entries import diagnoses_of
 from failuretwin.decision.learned.feature_encoder import Signals, mean_lag_s, signals_of
 from failuretwin.digital_model.arm_classes import class_of, generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections
@@ -27,13 +28,6 @@ def _hypotheses(runs: xr.Dataset) -> list[Hypothesis]:
     return [Hypothesis.parse(name) for name in runs.attrs["hypotheses"].split(",")]
 
 
-def _diagnoses(runs: xr.Dataset, names: list[str], chances: FloatArray) -> list[Diagnosis]:
-    return [
-        Diagnosis(str(run), dict(zip(names, map(float, row), strict=True)))
-        for run, row in zip(runs["run"].values, chances, strict=True)
-    ]
-
-
 class Chance:
     """Every hypothesis is equally probable."""
 
@@ -46,7 +40,7 @@ class Chance:
     def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
         """Return equal probabilities."""
         names = runs.attrs["hypotheses"].split(",")
-        return _diagnoses(runs, names, np.full((runs.sizes["run"], len(names)), 1.0 / len(names)))
+        return diagnoses_of(runs, names, [[1.0 / len(names)] * len(names)] * runs.sizes["run"])
 
 
 class Calibrated:
@@ -114,7 +108,7 @@ class KalmanBank(Calibrated):
             likelihood.append(self.log_likelihood(readings, angle, displacement))
         alike = np.array([_alike(signals.time[seen]) for seen in signals.seen])
         chances = softmax(np.stack(likelihood, axis=1) / alike[:, None], axis=1)
-        return _diagnoses(runs, [str(h) for h in hypotheses], chances)
+        return diagnoses_of(runs, [str(h) for h in hypotheses], chances.tolist())
 
     def _expected(self, signals: Signals, runs: xr.Dataset) -> FloatArray:
         """Return the angles of a healthy arm, (run, time, motor) [rad]."""

@@ -12,7 +12,7 @@ X is (run, 100 times channel): at each tenth of a second the commands [rad], the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -74,6 +74,16 @@ def features_of(runs: xr.Dataset, twin: DigitalTwin) -> FloatArray:
     return channels.reshape(len(channels), -1)
 
 
+def diagnoses_of(
+    runs: xr.Dataset, names: Sequence[str], chances: Iterable[Iterable[float]]
+) -> list[Diagnosis]:
+    """Return the diagnoses of runs by the probability of each class, (run, class)."""
+    return [
+        Diagnosis(str(run), dict(zip(names, row, strict=True)))
+        for run, row in zip(runs["run"].values, chances, strict=True)
+    ]
+
+
 class Classifier:
     """A scikit-learn classifier as an entry; it is fitted when the first answer is wanted."""
 
@@ -113,10 +123,7 @@ class Classifier:
                 f"{self._name}: predict_proba(X) gave shape {chances.shape}. Expected one row per "
                 f"run and one column per class, ({runs.sizes['run']}, {len(names)})."
             )
-        found = [
-            Diagnosis(str(run), dict(zip(names, row, strict=True)))
-            for run, row in zip(runs["run"].values, chances, strict=True)
-        ]
+        found = diagnoses_of(runs, names, chances)
         return [replace(one, posterior=checked_posterior(one, self._name)) for one in found]
 
     @property

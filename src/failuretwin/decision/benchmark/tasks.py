@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.core.hypothesis import Diagnosis, Hypothesis, motor_probabilities
+from failuretwin.core.hypothesis import SURE, Diagnosis, Hypothesis, motor_probabilities
 from failuretwin.core.types import FloatArray
 from failuretwin.decision import scoring
 from failuretwin.decision.evaluation import Evaluation, Truths, evaluate
@@ -108,6 +108,16 @@ class Judgement:
         """Return the true fault of the run of an answer."""
         return self.truths[answer.run].fault
 
+    @property
+    def healthy(self) -> Answers:
+        """Answers to healthy runs."""
+        return [answer for answer in self.answers if self.of(answer) == scoring.HEALTHY]
+
+    @property
+    def faulty(self) -> Answers:
+        """Answers to faulty runs."""
+        return [answer for answer in self.answers if self.of(answer) != scoring.HEALTHY]
+
 
 Scorer = Callable[[Judgement], list[Score]]
 
@@ -146,15 +156,18 @@ def _is_fault(name: str | None) -> bool:
     return name not in (None, scoring.HEALTHY)
 
 
+def _false_alarms(judged: Judgement) -> Score:
+    return _share("healthy called faulty [%]", [_is_fault(a.diagnosis) for a in judged.healthy])
+
+
 def _detect(judged: Judgement) -> list[Score]:
-    pairs = [(judged.of(a) != scoring.HEALTHY, a) for a in judged.answers]
-    healthy = [a.posterior.get(scoring.HEALTHY, 0.0) for _, a in pairs]
-    of_truth = [1.0 - p if f else p for (f, _), p in zip(pairs, healthy, strict=True)]
-    with np.errstate(divide="ignore"):
-        nats = -np.log(np.clip(of_truth, 0.0, 1.0)) + 0.0  # sums may round above 1
+    healthy = np.array([a.posterior.get(scoring.HEALTHY, 0.0) for a in judged.answers])
+    faulty = np.array([judged.of(a) != scoring.HEALTHY for a in judged.answers])
+    with np.errstate(divide="ignore"):  # sums may round above 1
+        nats = -np.log(np.clip(np.where(faulty, 1.0 - healthy, healthy), 0.0, 1.0)) + 0.0
     return [
-        _share("healthy called faulty [%]", [_is_fault(a.diagnosis) for f, a in pairs if not f]),
-        _share("faulty missed [%]", [not _is_fault(a.diagnosis) for f, a in pairs if f]),
+        _false_alarms(judged),
+        _share("faulty missed [%]", [not _is_fault(a.diagnosis) for a in judged.faulty]),
         _mean("log score, healthy or not [nats]", nats),
     ]
 
@@ -193,20 +206,15 @@ def _interval_scores(quantity: str) -> Scorer:
 
 
 def _unknown(judged: Judgement) -> list[Score]:
-    foreign = [a for a in judged.answers if judged.of(a) != scoring.HEALTHY]
-    healthy = [a for a in judged.answers if judged.of(a) == scoring.HEALTHY]
-    motors = [(Hypothesis.parse(judged.of(a)).faults[0].motor, a) for a in foreign]
+    motors = [(Hypothesis.parse(judged.of(a)).faults[0].motor, a) for a in judged.faulty]
     return [
-        _share("called unknown [%]", [a.diagnosis == scoring.UNKNOWN for a in foreign]),
+        _share("called unknown [%]", [a.diagnosis == scoring.UNKNOWN for a in judged.faulty]),
         _share(
             "another motor blamed above 95 % [%]",
             [_blamed(a, without=motor) for motor, a in motors],
         ),
-        _share("healthy called faulty [%]", [_is_fault(a.diagnosis) for a in healthy]),
+        _false_alarms(judged),
     ]
-
-
-SURE = 0.95
 
 
 def _blamed(answer: Answer, without: str = "") -> bool:
@@ -217,7 +225,7 @@ def _blamed(answer: Answer, without: str = "") -> bool:
 
 def _smallest(judged: Judgement) -> list[Score]:
     """Return the share of named faults; the smallest size from which 90 % are named."""
-    faulty = [a for a in judged.answers if judged.of(a) != scoring.HEALTHY]
+    faulty = judged.faulty
     size = np.array([judged.truths[a.run].magnitude for a in faulty])
     right = np.array([a.diagnosis == judged.of(a) for a in faulty])
     steps = np.unique(np.round(size, 5))
@@ -228,10 +236,7 @@ def _smallest(judged: Judgement) -> list[Score]:
     return [
         Score("size from which 90 % are named [deg]", smallest, below, smallest, len(faulty)),
         _share("errors named [%]", right.tolist()),
-        _share(
-            "healthy called faulty [%]",
-            [_is_fault(a.diagnosis) for a in judged.answers if judged.of(a) == scoring.HEALTHY],
-        ),
+        _false_alarms(judged),
     ]
 
 

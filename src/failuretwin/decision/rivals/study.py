@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import load_run_set, replacing, save_run_set, write_text
+from failuretwin.decision.benchmark.entries import diagnoses_of
 from failuretwin.decision.benchmark.tasks import PREFIXES_S, TASKS, Judgement
 from failuretwin.decision.evaluation import Truths, compare, evaluate
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, signals_of
@@ -139,8 +140,8 @@ def run_job(plan: RivalPlan, profile: str, folder: Path, job: RivalJob) -> None:
     chances += [answer(view) for view in range(1, len(VIEWS))]
     names = class_names(robot)
     for suffix, rows in zip(VIEWS, chances, strict=True):
-        found = list(_diagnoses(job, names, test, rows))
-        write_json_lines(found, _answers(folder, job, suffix))
+        found = diagnoses_of(test, names, rows.tolist())
+        write_json_lines(_stated(found, job, test), _answers(folder, job, suffix))
     cost = {"training_s": trained - start, "run_ms": 1e3 * seconds / len(test["run"])}
     write_text(json.dumps(cost), _cost(folder, job))
 
@@ -154,13 +155,11 @@ def _cost(folder: Path, job: RivalJob) -> Path:
     return folder / ANSWERS / f"{job.name}.json"
 
 
-def _diagnoses(
-    job: RivalJob, names: Sequence[str], test: xr.Dataset, chances: FloatArray
-) -> Iterator[Diagnosis]:
-    truth, method = test["fault"].values, f"{job.method}, {job.twin} twin"
-    for run, row, fault in zip(test["run"].values, chances, truth, strict=True):
-        posterior = dict(zip(names, map(float, row), strict=True))
-        yield Diagnosis(str(run), posterior, truth=str(fault), protocol=job.protocol, method=method)
+def _stated(found: Sequence[Diagnosis], job: RivalJob, test: xr.Dataset) -> list[Diagnosis]:
+    """Return diagnoses with what was true and which job made them."""
+    of: dict[str, Any] = {"protocol": job.protocol, "method": f"{job.method}, {job.twin} twin"}
+    faults = test["fault"].values
+    return [replace(one, truth=str(f), **of) for one, f in zip(found, faults, strict=True)]
 
 
 def _by_model(

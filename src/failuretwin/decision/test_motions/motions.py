@@ -20,6 +20,7 @@ from failuretwin.connection.links.base import CommandSent, Order
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.bags import read_targets
+from failuretwin.data_knowledge.readers.table import first_line
 from failuretwin.data_knowledge.store import write_text
 from failuretwin.decision.test_motions.design import Movement
 from failuretwin.digital_model.robot import Robot
@@ -171,11 +172,7 @@ def holds_motions(path: Path, robot: Robot) -> bool:
         return read_targets(path, robot) is not None
     if path.suffix != ".csv":
         return path.suffix == ".json"
-    try:
-        with path.open(encoding="utf-8") as file:
-            return file.readline().strip().split(",") == _columns(robot.motor_names)
-    except (OSError, ValueError):
-        return False
+    return first_line(path).split(",") == _columns(robot.motor_names)
 
 
 def _bag_motions(path: Path, robot: Robot) -> Motions:
