@@ -8,7 +8,7 @@ published durations, exactly.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -201,7 +201,7 @@ class _Run:
             return self._joined(self._whole_poses(self.path.value[0])[:1], [])
         if self.spans == [(0, len(self.path.time) - 1)]:
             raise _NoWholeUnitsError("the record holds no settled pose")
-        return self._chain(self._whole_ramps)
+        return self._chain()
 
     def _whole_poses(self, point: FloatArray) -> FloatArray:
         """Return the poses in whole counts at a point, (pose, motor) [rad], usual ones first.
@@ -227,7 +227,9 @@ class _Run:
         return poses[_nearest_first(poses, zero)]
 
     def _whole_ramps(self, m: int, origins: FloatArray | None) -> Movements:
-        """Return the ramps between whole counts that make movement `m`.
+        """Return the ramps between whole counts that make movement `m`, the best first.
+
+        They begin at some origins (pose, motor) [rad]; None: anywhere.
 
         Raises:
             _NoWholeUnitsError: If there are none.
@@ -297,18 +299,15 @@ class _Run:
         low, high = np.sort(self.twin.robot.servo_units.to_counts(ends), axis=0)
         return np.stack([np.ceil(low - 1e-9), np.floor(high + 1e-9)])
 
-    def _chain(self, ramps_of: Callable[[int, FloatArray | None], Movements]) -> Movements:
+    def _chain(self) -> Movements:
         """Return movements whose origins are the targets before them.
 
         Where a ramp leaves its target open, the next one decides.
-
-        Args:
-            ramps_of: Possible ramps of a movement, the best first, from some origins (pose, motor)
-                [rad]; None: free.
         """
-        found = [ramps_of(0, None)]
+        found = [self._whole_ramps(0, None)]
         for m in range(1, len(self.spans)):
-            found.append(ramps_of(m, np.unique(found[-1].target[:, 0], axis=0)))
+            origins = np.unique(found[-1].target[:, 0], axis=0)
+            found.append(self._whole_ramps(m, origins))
         chain = [found.pop()[:1]]
         while found:
             leads = (found[-1].target[:, 0] == chain[0].initial).all(axis=1)

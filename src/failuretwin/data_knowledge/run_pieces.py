@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,7 +75,9 @@ class RunPieces:
     def pieces(self) -> list[Piece]:
         """All pieces, in the order of the sources."""
         found = list[Piece]()
-        for stored, logs in groupby(find_logs(self.sources, self.options), _is_run_set):
+        for stored, logs in groupby(
+            find_logs(self.sources, self.options), attrgetter("is_run_set")
+        ):
             some = tuple(logs)
             if stored:
                 found += [Piece((log,), rows) for log in some for rows in _rows(log)]
@@ -143,10 +146,6 @@ def open_runs(source: Path, robot: Robot, options: ReadOptions) -> xr.Dataset:
     logs = find_logs([source], options)
     stored = len(logs) == 1 and logs[0].is_run_set
     return _opened(source) if stored else read_logs(logs, robot, options)
-
-
-def _is_run_set(log: Log) -> bool:
-    return log.is_run_set
 
 
 def _spread(count: int, most: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

@@ -129,8 +129,7 @@ def add_belief(
         )
     stated: dict[str, Any] = {"follower": line.follower, "start": line.start, "runs": belief.runs}
     stated |= {"rows": [dict(row) for row in belief.rows], "arrays": _packed(belief.arrays)}
-    of = {"robot_id": rows.robot, "session_id": rows.session}
-    return add_rows(connection, beliefs, [{**stated, **of}])[0]
+    return add_rows(connection, beliefs, [{**stated, **rows.columns}])[0]
 
 
 def _packed(arrays: Arrays) -> bytes:

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
@@ -141,21 +142,11 @@ def fleet_faults(connection: sa.Connection, kind: str) -> FleetFaults:
         .where(kinds.c.kind == kind, judged.c.verdict == CONFIRMED)
         .order_by(judged.c.motor, judged.c.mode, judged.c.since)
     )
-    found = [Confirmed(*row) for row in connection.execute(query)]
+    found = connection.execute(query).all()
     lives = [life for life in _lives(connection) if life.kind == kind]
     motors = sorted({motor for life in lives for motor in life.motors})
     by_age = {motor: _by_age(motor, lives, found) for motor in motors}
     return FleetFaults(kind, robot_count, 24.0 * days, _count(found), by_age)
-
-
-@dataclass(frozen=True)
-class Confirmed:
-    """A confirmed fault: row of the robot, motor, mode, time (UTC)."""
-
-    robot: int
-    motor: str
-    mode: str
-    since: datetime
 
 
 @dataclass(frozen=True)
@@ -202,14 +193,14 @@ def _lives(connection: sa.Connection, robot: int | None = None) -> list[_Life]:
     ]
 
 
-def _by_age(motor: str, lives: Sequence[_Life], found: Sequence[Confirmed]) -> list[AgeBand]:
+def _by_age(motor: str, lives: Sequence[_Life], found: Sequence[Any]) -> list[AgeBand]:
     """Return the faults of a motor, and its time at risk, in each of `AGE_BANDS_H`."""
     hours = np.zeros(len(AGE_BANDS_H) - 1)
     for life in lives:
         hours += sum(_in_bands(span) for span in pairwise([*life.starts(motor), life.last]))
     of_robot = {life.robot: life for life in lives}
-    own = [one for one in found if one.motor == motor and one.robot in of_robot]
-    ages = [of_robot[one.robot].age_h(motor, one.since) for one in own]
+    own = [one for one in found if one.motor == motor and one.robot_id in of_robot]
+    ages = [of_robot[one.robot_id].age_h(motor, one.since) for one in own]
     bands = list(pairwise(AGE_BANDS_H))
     inside = [[one for one, a in zip(own, ages, strict=True) if b[0] <= a < b[1]] for b in bands]
     return [AgeBand(*bands[k], float(hours[k]), _count(inside[k])) for k in range(len(bands))]
@@ -221,7 +212,7 @@ def _in_bands(span: tuple[datetime, datetime]) -> FloatArray:
     return np.diff(np.minimum(AGE_BANDS_H, length))
 
 
-def _count(found: Sequence[Confirmed]) -> dict[str, int]:
+def _count(found: Sequence[Any]) -> dict[str, int]:
     return dict(Counter(f"{one.motor}:{one.mode}" for one in found))
 
 

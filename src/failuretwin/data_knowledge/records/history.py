@@ -202,7 +202,7 @@ class History:
     @property
     def health(self) -> str:
         """One sentence on the state of the robot, its days in UTC."""
-        return self.health_by(_day)
+        return self.health_by("{:%Y-%m-%d}".format)
 
     def health_by(self, day: Callable[[datetime], str]) -> str:
         """Return the same sentence with days in another zone."""
@@ -217,9 +217,10 @@ class History:
     @property
     def timeline(self) -> list[Moment]:
         """Everything with its time, the oldest first; of diagnoses and notes only the last."""
-        moments = [
-            Moment(one.at, _kind_of(one), f"{one.run}: {one.verdict}") for one in self.recent
-        ]
+        moments = []
+        for one in self.recent:
+            kind = "run" if one.command == "diagnose" else one.command
+            moments.append(Moment(one.at, kind, f"{one.run}: {one.verdict}"))
         moments += [Moment(one.at, one.command, one.text) for one in self.notes]
         for episode in self.episodes:
             moments += _moments_of(episode)
@@ -228,14 +229,6 @@ class History:
             moments.append(Moment(calibration.valid_from, "calibration", text))
         moments += [Moment(one.at, "repair", _repair_text(one)) for one in self.repairs]
         return sorted(moments, key=lambda moment: moment.at)
-
-
-def _day(time: datetime) -> str:
-    return f"{time:%Y-%m-%d}"
-
-
-def _kind_of(diagnosis: StoredDiagnosis) -> str:
-    return "run" if diagnosis.command == "diagnose" else diagnosis.command
 
 
 def _moments_of(episode: FaultEpisode) -> list[Moment]:

@@ -68,7 +68,7 @@ def add_offsets(
     found: Sequence[MotorOffset],
 ) -> None:
     """Store the offsets that a session found at a time (UTC)."""
-    of = {"robot_id": rows.robot, "session_id": rows.session, "at": at}
+    of = {**rows.columns, "at": at}
     add_rows(connection, offsets, [{**asdict(one), **of} for one in found])
 
 
@@ -95,15 +95,14 @@ def read_drifts(connection: sa.Connection, robot: int) -> tuple[Drift, ...]:
         rows = rows.where(offsets.c.session_id.in_([session for _, session in shown]))
         for one in connection.execute(rows.order_by(offsets.c.at, offsets.c.id)):
             found.setdefault((one.motor, one.name, one.unit), []).append(one)
-    return tuple(_drift(*key, rows) for key, rows in sorted(found.items()))
+    columns = ("at", "value", "deviation")
+    return tuple(
+        Drift(*key, *(tuple(getattr(one, column) for one in rows) for column in columns))
+        for key, rows in sorted(found.items())
+    )
 
 
 def _thinned(known: Sequence[tuple[datetime, int]]) -> list[tuple[datetime, int]]:
     """Return at most `POINTS` of some sessions, evenly, first and last among them."""
     count = min(POINTS, len(known))
     return [known[(len(known) - 1) * k // max(1, count - 1)] for k in range(count)]
-
-
-def _drift(motor: str, name: str, unit: str, rows: Sequence[Any]) -> Drift:
-    columns = zip(*((one.at, one.value, one.deviation) for one in rows), strict=True)
-    return Drift(motor, name, unit, *columns)

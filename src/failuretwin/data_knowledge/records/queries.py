@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from typing import Any
 
 import sqlalchemy as sa
 
-from failuretwin.core.errors import check_name
-from failuretwin.data_knowledge.records import CHECK_DAYS
 from failuretwin.data_knowledge.records.episodes import CONFIRMED
 from failuretwin.data_knowledge.records.fleet import (
     LAST_RUN,
@@ -191,24 +189,7 @@ QUESTIONS = {
     ),
     "due": _Question("Which robots are due for a check?", ("robot", "last_run", "why"), _due),
 }
-"""Ready questions by name."""
-
-
-def ask(connection: sa.Connection, name: str, days: float = CHECK_DAYS) -> QueryAnswer:
-    """Return the answer to a ready question.
-
-    Args:
-        connection: Connection to the store.
-        name: Name of the question, see `QUESTIONS`.
-        days: Time without a run after which a robot is due [days].
-
-    Raises:
-        InputError: If there is no such question.
-    """
-    check_name("query", name, QUESTIONS)
-    question = QUESTIONS[name]
-    rows = question.ask(connection, datetime.now(UTC), days)
-    return QueryAnswer(name, question.title, question.columns, tuple(rows))
+"""Ready questions by name; they are asked at a time (UTC), a robot is due after some days."""
 
 
 # All robots at a glance, and the runs of one.

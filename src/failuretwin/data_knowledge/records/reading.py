@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
 
+from failuretwin.core.errors import check_name
 from failuretwin.data_knowledge.records import CHECK_DAYS, writing
 from failuretwin.data_knowledge.records.asset_shell import export_shell
 from failuretwin.data_knowledge.records.beliefs import (
@@ -27,10 +29,10 @@ from failuretwin.data_knowledge.records.fleet import (
 from failuretwin.data_knowledge.records.history import History, StoredCalibration, read_history
 from failuretwin.data_knowledge.records.log_files import StoreCheck, checked
 from failuretwin.data_knowledge.records.queries import (
+    QUESTIONS,
     QueryAnswer,
     RobotGlance,
     StoredRun,
-    ask,
     read_overview,
     read_runs_of,
 )
@@ -123,8 +125,11 @@ class StoreReader:
         Raises:
             InputError: If there is no such question.
         """
+        check_name("query", name, QUESTIONS)
+        question = QUESTIONS[name]
         with self._database.reading() as connection:
-            return ask(connection, name, days)
+            rows = question.ask(connection, datetime.now(UTC), days)
+        return QueryAnswer(name, question.title, question.columns, tuple(rows))
 
     def fleet_faults(self, kind: str) -> FleetFaults:
         """Return the confirmed faults of all robots of a kind, and the time that they were seen.

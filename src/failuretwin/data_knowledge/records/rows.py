@@ -17,6 +17,11 @@ class SessionRows:
     robot: int
     run: int | None = None
 
+    @property
+    def columns(self) -> dict[str, Any]:
+        """Columns by which rows of the session refer to it and its robot."""
+        return {"session_id": self.session, "robot_id": self.robot}
+
 
 @dataclass(frozen=True)
 class Basis:

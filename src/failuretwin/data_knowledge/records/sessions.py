@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
 
 import sqlalchemy as sa
 
@@ -146,9 +145,8 @@ def _add_notes(
     behind: Sequence[int | None],
 ) -> None:
     """Write notes of a session; `behind` are the rows of their diagnoses."""
-    of = {"session_id": rows.session, "robot_id": rows.robot}
-    stated: list[dict[str, Any]] = [
-        {**of, "at": one.at, "text": one.text, "diagnosis_id": row}
+    stated = [
+        {**rows.columns, "at": one.at, "text": one.text, "diagnosis_id": row}
         for one, row in zip(happened, behind, strict=True)
     ]
     add_rows(connection, notes, stated)

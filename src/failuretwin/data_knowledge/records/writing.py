@@ -227,12 +227,8 @@ def add_diagnoses(
     connection: sa.Connection, rows: SessionRows, kept: Kept, at: datetime
 ) -> list[int]:
     """Store diagnoses of runs, and return their rows."""
-    of = {"robot_id": rows.robot, "session_id": rows.session}
-    stated = [{**_diagnosis_row(one, digest, at), **of, "run_id": run} for one, run, digest in kept]
-    added = add_rows(connection, diagnoses, stated)
-    found = [(row, at, one) for row, (one, _, _) in zip(added, kept, strict=True)]
-    add_residuals(connection, rows.robot, found)
-    return added
+    stated = [{**_diagnosis_row(one, digest, at), "run_id": run} for one, run, digest in kept]
+    return _add_diagnoses(connection, rows, stated, [(at, one) for one, _, _ in kept])
 
 
 def add_session_diagnoses(
@@ -241,14 +237,21 @@ def add_session_diagnoses(
     found: Sequence[tuple[datetime, Diagnosis | None]],
 ) -> list[int | None]:
     """Store diagnoses of the run of a session over time, and return their rows in that order."""
-    of = {"robot_id": rows.robot, "session_id": rows.session, "run_id": rows.run}
-    kept = [(at, one) for at, one in found if one is not None]
-    stated = [{**_diagnosis_row(one, _digest_of(one, None), at), **of} for at, one in kept]
-    added = add_rows(connection, diagnoses, stated)
-    known = [(row, *one) for row, one in zip(added, kept, strict=True)]
-    add_residuals(connection, rows.robot, known)
-    numbers = iter(added)
+    kept, run = [(at, one) for at, one in found if one is not None], {"run_id": rows.run}
+    stated = [{**_diagnosis_row(one, _digest_of(one, None), at), **run} for at, one in kept]
+    numbers = iter(_add_diagnoses(connection, rows, stated, kept))
     return [None if one is None else next(numbers) for _, one in found]
+
+
+def _add_diagnoses(
+    connection: sa.Connection,
+    rows: SessionRows,
+    stated: Sequence[dict[str, Any]],
+    found: Sequence[tuple[datetime, Diagnosis]],
+) -> list[int]:
+    added = add_rows(connection, diagnoses, [{**one, **rows.columns} for one in stated])
+    add_residuals(connection, rows.robot, [(n, *one) for n, one in zip(added, found, strict=True)])
+    return added
 
 
 def _digest_of(diagnosis: Diagnosis, calibration: int | None) -> str:

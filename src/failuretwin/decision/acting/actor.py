@@ -139,19 +139,17 @@ class Actor:
         if self._attempt.asks:
             self._attempt.asks, self._attempt.anew = False, True
             return
-        self._attempt.movements += 1
+        attempt = self._attempt
+        attempt.movements += 1
         error, feedback = self._error_m(seen), self._settings.feedback
-        if self._attempt.movements == 1:
-            self._attempt.first_error_m = error
+        if attempt.movements == 1:
+            attempt.first_error_m = error
         if error <= self.target.tolerance_m and self._error_rad(seen) <= DIRECTION_TOLERANCE_RAD:
             self._conclude("")
-        elif self._attempt.movements >= (self._settings.most_movements if feedback else 1):
-            self._conclude(f"not reached in {self._attempt.movements} movements")
-        elif self._tried_in_vain():
+        elif attempt.movements >= (self._settings.most_movements if feedback else 1):
+            self._conclude(f"not reached in {attempt.movements} movements")
+        elif attempt.as_healthy and self.belief.confirmed and not attempt.repeats:
             self._conclude("out of reach, tried once as if the arm were healthy")
-
-    def _tried_in_vain(self) -> bool:
-        return self._attempt.as_healthy and self.belief.confirmed and not self._attempt.repeats
 
     def _error_m(self, seen: Seen) -> float:
         if seen.point is None:

@@ -15,7 +15,7 @@ import numpy as np
 from failuretwin.core.config import from_table
 from failuretwin.core.hypothesis import Alarm, Diagnosis
 from failuretwin.core.numerics import log_of
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import IntArray
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
 from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.decision.streaming.monitor import candidates, evidence_since, mixture_of
@@ -28,7 +28,7 @@ RULE = ("hours", "passed", "unnamed")
 
 
 class FleetMonitor:
-    """Watches many robots of one kind.
+    """Watches many robots of one kind; `fleet` takes their samples, and says whom to `judge`.
 
     Args:
         diagnoser: The method, settled poses alone (``whole_run=False``).
@@ -50,21 +50,6 @@ class FleetMonitor:
         self._rules = [
             AlarmRule(self.fleet.hypotheses, rates, false_alarms_per_100h) for _ in range(robots)
         ]
-
-    @property
-    def robots(self) -> int:
-        """How many robots there are."""
-        return self.fleet.robots
-
-    def see(self, time: FloatArray, command: FloatArray, measured: FloatArray) -> IntArray:
-        """Take a sample of each robot and return those that `judge` must see before their next.
-
-        Args:
-            time: When it was taken, (robot,) [s]; NaN: there is none of this robot.
-            command: References, (robot, motor) [rad]; NaN where not known.
-            measured: Tool positions, (robot, axis) [m]; NaN where there is no reading.
-        """
-        return self.fleet.see(time, command, measured)
 
     def judge(self, robots: IntArray) -> None:
         """Renew what is believed of some robots by what their last movements say.
@@ -88,10 +73,6 @@ class FleetMonitor:
         seen = self.fleet.forgotten[robot] + self.fleet.remembered[robot]
         withheld = seen <= PROOF and alarm.cause and not is_held(alarm.cause)
         return Alarm() if withheld else alarm
-
-    def trouble(self, robot: int) -> str:
-        """Return why the readings of a robot say nothing of its motors; empty: they do."""
-        return self.fleet.trouble(robot)
 
     def diagnosis(self, robot: int) -> Diagnosis | None:
         """Return the diagnosis of a robot in words; None where nothing can be said yet."""

@@ -129,8 +129,8 @@ class _Group:
     def join(self, name: str) -> int:
         """Add a robot and return its row."""
         old = self.monitor
-        if len(self.names) == old.robots:
-            self.monitor = FleetMonitor(old.diagnoser, 2 * old.robots, old.budget)
+        if len(self.names) == old.fleet.robots:
+            self.monitor = FleetMonitor(old.diagnoser, 2 * old.fleet.robots, old.budget)
             self.monitor.restore(old.state(), old.alarms())
         self.names.append(name)
         return len(self.names) - 1
@@ -152,9 +152,9 @@ class _Group:
         """Take the next sample of some robots, and return those to be judged."""
         monitor = self.monitor
         motors = len(monitor.diagnoser.twin.robot.motors)
-        time = np.full(monitor.robots, np.nan)
-        command = np.full((monitor.robots, motors), np.nan)
-        measured = np.full((monitor.robots, 3), np.nan)
+        time = np.full(monitor.fleet.robots, np.nan)
+        command = np.full((monitor.fleet.robots, motors), np.nan)
+        measured = np.full((monitor.fleet.robots, 3), np.nan)
         behind = {}
         for row in rows:
             waiting = self.pending[row]
@@ -165,7 +165,7 @@ class _Group:
                 measured[row] = point
             if not waiting:
                 del self.pending[row]
-        return {row: behind[row] for row in monitor.see(time, command, measured).tolist()}
+        return {row: behind[row] for row in monitor.fleet.see(time, command, measured).tolist()}
 
 
 class Partition:
@@ -309,7 +309,7 @@ class Partition:
         found = {}
         for name, robot in self._robots.items():
             monitor = self._groups[robot.kind].monitor
-            trouble, alarm = monitor.trouble(robot.row), robot.told
+            trouble, alarm = monitor.fleet.trouble(robot.row), robot.told
             judged = bool(monitor.fleet.judged[robot.row])
             state = "undecided" if trouble else alarm.state if judged else "waiting"
             found[name] = {
@@ -389,7 +389,7 @@ class Partition:
         for number, table in enumerate(header["groups"]):
             profile = ProfileMessage(**table["profile"])
             group = _Group(resolve(profile), budget)
-            room = group.monitor.robots
+            room = group.monitor.fleet.robots
             while room < len(table["names"]):
                 room *= 2
             group.monitor = FleetMonitor(group.monitor.diagnoser, room, budget)
