@@ -25,7 +25,7 @@ from failuretwin.connection.links.base import OK, Answer
 from failuretwin.connection.tracked_diagnosis import read_rows
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import ALL_CLEAR, RAISED, Alarm
-from failuretwin.data_knowledge.records.rows import Basis
+from failuretwin.data_knowledge.records.schema import Basis
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from store_places import diagnosis
 

@@ -9,7 +9,7 @@ import pytest
 
 import failuretwin as ft
 from failuretwin.data_knowledge.records.log_files import LogFile
-from failuretwin.data_knowledge.records.rows import Basis
+from failuretwin.data_knowledge.records.schema import Basis
 from failuretwin.data_knowledge.records.sessions import Note
 from killed_writers import calls_before_kill
 from store_places import diagnosis

@@ -28,8 +28,7 @@ from failuretwin.data_knowledge.records import migrations, writing
 from failuretwin.data_knowledge.records.beliefs import Belief, BeliefLine
 from failuretwin.data_knowledge.records.database import Database
 from failuretwin.data_knowledge.records.offsets import MotorOffset
-from failuretwin.data_knowledge.records.rows import Basis
-from failuretwin.data_knowledge.records.schema import CLOSES, metadata
+from failuretwin.data_knowledge.records.schema import CLOSES, Basis, metadata
 from failuretwin.data_knowledge.records.sessions import Note
 from full_disks import full_disk
 from killed_writers import in_a_child

@@ -13,7 +13,7 @@ from failuretwin.data_knowledge.records import beliefs
 from failuretwin.data_knowledge.records.beliefs import Belief, BeliefLine
 from failuretwin.data_knowledge.records.log_files import LogFile
 from failuretwin.data_knowledge.records.offsets import MotorOffset
-from failuretwin.data_knowledge.records.rows import Basis
+from failuretwin.data_knowledge.records.schema import Basis
 from failuretwin.data_knowledge.records.sessions import Note
 from store_places import diagnosis
 

@@ -14,7 +14,7 @@ import failuretwin as ft
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.data_knowledge.records.log_files import LogFile, log_file
 from failuretwin.data_knowledge.records.queries import QUESTIONS
-from failuretwin.data_knowledge.records.rows import Basis
+from failuretwin.data_knowledge.records.schema import Basis
 from store_places import diagnosis
 
 DAY = datetime(2026, 3, 2, tzinfo=UTC)

@@ -29,7 +29,7 @@ from failuretwin.data_knowledge.records.beliefs import Belief, BeliefLine
 from failuretwin.data_knowledge.records.history import FaultEpisode
 from failuretwin.data_knowledge.records.log_files import LogFile
 from failuretwin.data_knowledge.records.offsets import MotorOffset
-from failuretwin.data_knowledge.records.rows import Basis
+from failuretwin.data_knowledge.records.schema import Basis
 from failuretwin.data_knowledge.records.sessions import Note, Session
 from failuretwin.decision.acting.session import AlarmChange
 from failuretwin.inference.together.life_filter import OFFSETS, LifeFilter

@@ -19,7 +19,7 @@ from failuretwin.core.runs import RunSet, concatenate
 from failuretwin.data_knowledge.records.history import FaultEpisode, StoredCalibration
 from failuretwin.data_knowledge.records.log_files import LogFile, log_file
 from failuretwin.data_knowledge.records.offsets import MotorOffset
-from failuretwin.data_knowledge.records.rows import Basis
+from failuretwin.data_knowledge.records.schema import Basis
 from failuretwin.data_knowledge.records.sessions import Note
 from failuretwin.data_knowledge.records.store import Remembered, Store
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, calibration_from_table

@@ -20,7 +20,7 @@ from failuretwin.connection.links.base import CommandSent, Reading
 from failuretwin.connection.links.ros1 import Ros1Transport
 from failuretwin.connection.links.ros_link import RosSource
 from failuretwin.connection.links.ros_messages import RosTopics
-from failuretwin.decision.acting.halting import HOLD_S, STANDS
+from failuretwin.decision.acting.work import HOLD_S, STANDS
 from waiting import wait_for
 
 pytestmark = [

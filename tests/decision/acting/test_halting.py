@@ -7,8 +7,8 @@ import pytest
 
 from failuretwin.connection.links.base import LinkCounts, Reading
 from failuretwin.core.errors import InputError
-from failuretwin.decision.acting import halting
-from failuretwin.decision.acting.halting import (
+from failuretwin.decision.acting import work
+from failuretwin.decision.acting.work import (
     LONGEST_S,
     MOVES,
     SILENT,
@@ -57,7 +57,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch):
     made = Clock()
-    monkeypatch.setattr(halting, "time", made)
+    monkeypatch.setattr(work, "time", made)
     return made
 
 
@@ -81,7 +81,7 @@ def test_an_arm_that_did_not_hear_is_told_again_where_it_is_then(clock):
 def test_an_arm_that_never_hears_is_said_to_move(clock):
     arm = Arm(clock, lost=range(100))
     assert bring_to_rest(arm) == MOVES
-    assert len(arm.sent) == pytest.approx(LONGEST_S / halting.AGAIN_S, abs=2)
+    assert len(arm.sent) == pytest.approx(LONGEST_S / work.AGAIN_S, abs=2)
 
 
 def test_an_arm_that_falls_silent_is_not_said_to_stand(clock):

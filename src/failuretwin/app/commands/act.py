@@ -122,7 +122,7 @@ def stop(place: str, topics: Path | None, robot: opt.RobotOptions) -> None:
     in reach.
     """
     from failuretwin.app.arms import commander_of
-    from failuretwin.decision.acting.halting import bring_to_rest
+    from failuretwin.decision.acting.work import bring_to_rest
 
     if place == opt.EMULATED:
         raise InputError(f"an emulated arm ends with its process. Name {', '.join(NETWORKS)}.")

@@ -13,8 +13,7 @@ from failuretwin.connection.links import base
 from failuretwin.connection.links.base import Commander, Order
 from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.halting import NOT_READ, angles_of, bring_to_rest
-from failuretwin.decision.acting.work import Halted
+from failuretwin.decision.acting.work import NOT_READ, Halted, angles_of, bring_to_rest
 from failuretwin.decision.test_motions.health_check import Checking, CheckResult
 
 HANGS_S = 5.0

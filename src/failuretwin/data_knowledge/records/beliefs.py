@@ -17,8 +17,7 @@ import sqlalchemy as sa
 
 from failuretwin import __version__
 from failuretwin.core.errors import InputError, OutputError
-from failuretwin.data_knowledge.records.rows import SessionRows, add_rows
-from failuretwin.data_knowledge.records.schema import beliefs, sessions
+from failuretwin.data_knowledge.records.schema import SessionRows, add_rows, beliefs, sessions
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 

@@ -9,8 +9,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from failuretwin.data_knowledge.records.rows import SessionRows, add_rows
-from failuretwin.data_knowledge.records.schema import offsets, sessions
+from failuretwin.data_knowledge.records.schema import SessionRows, add_rows, offsets, sessions
 
 POINTS = 20
 """Sessions that a drift shows at most."""

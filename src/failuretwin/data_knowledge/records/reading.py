@@ -10,7 +10,6 @@ import sqlalchemy as sa
 
 from failuretwin.core.errors import check_name
 from failuretwin.data_knowledge.records import CHECK_DAYS, writing
-from failuretwin.data_knowledge.records.asset_shell import export_shell
 from failuretwin.data_knowledge.records.beliefs import (
     Belief,
     BeliefLine,
@@ -19,7 +18,7 @@ from failuretwin.data_knowledge.records.beliefs import (
     read_belief,
 )
 from failuretwin.data_knowledge.records.database import Database
-from failuretwin.data_knowledge.records.export import export_parquet
+from failuretwin.data_knowledge.records.export import export_parquet, export_shell
 from failuretwin.data_knowledge.records.fleet import (
     FleetFaults,
     fleet_calibrations,
@@ -37,7 +36,6 @@ from failuretwin.data_knowledge.records.queries import (
     read_runs_of,
 )
 from failuretwin.data_knowledge.records.schema import robots
-from failuretwin.data_knowledge.records.statements import calibration_in_force
 
 
 class StoreReader:
@@ -62,7 +60,7 @@ class StoreReader:
         """
         with self._database.reading() as connection:
             row = _row_of(connection, robot)
-            return None if row is None else calibration_in_force(connection, row)
+            return None if row is None else writing.calibration_in_force(connection, row)
 
     def belief(self, robot: str, line: BeliefLine) -> tuple[Belief | None, str]:
         """Return the last belief of a line, and why that of another line is not used.

@@ -1,10 +1,11 @@
-"""Sessions: what a command did with a robot, stored as it happens."""
+"""Sessions: what a command did with a robot, stored as it happens, and the episodes that follow."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Any
 
 import sqlalchemy as sa
 
@@ -14,12 +15,19 @@ from failuretwin.data_knowledge.records.database import Database
 from failuretwin.data_knowledge.records.episodes import (
     RAISED,
     SUSPECTED,
+    Course,
     EpisodeTracker,
     NamedFault,
 )
 from failuretwin.data_knowledge.records.history import FaultEpisode, read_episodes
-from failuretwin.data_knowledge.records.rows import SessionRows, add_rows
-from failuretwin.data_knowledge.records.schema import episodes, notes
+from failuretwin.data_knowledge.records.schema import (
+    SessionRows,
+    add_rows,
+    diagnoses,
+    episode_events,
+    episodes,
+    notes,
+)
 
 
 @dataclass(frozen=True)
@@ -110,17 +118,15 @@ def follow_notes(
     if all(one.diagnosis is None for one in happened):
         _add_notes(connection, rows, happened, [None] * len(happened))
         return Followed((), alarmed)
-    tracker = writing.tracker_of(connection, rows.robot)
-    latest = writing.latest_run(connection, rows.robot)
+    tracker = tracker_of(connection, rows.robot)
+    latest = latest_run(connection, rows.robot)
     given = [(one.at, one.diagnosis) for one in happened]
     behind = writing.add_session_diagnoses(connection, rows, given)
     for number, one in enumerate(happened):
         if behind[number] is not None and (latest is None or one.at >= latest):
             alarmed = _follow_note(tracker, one, number, alarmed)
     _add_notes(connection, rows, happened, behind)
-    changed = writing.keep_episodes(connection, rows.robot, tracker.changed, behind)
-    known = read_episodes(connection, rows.robot, episodes.c.id.in_(changed)) if changed else ()
-    return Followed(known, alarmed)
+    return Followed(keep_episodes(connection, rows.robot, tracker.changed, behind), alarmed)
 
 
 def _follow_note(
@@ -150,3 +156,70 @@ def _add_notes(
         for one, row in zip(happened, behind, strict=True)
     ]
     add_rows(connection, notes, stated)
+
+
+# Episodes.
+
+
+def latest_run(connection: sa.Connection, robot: int) -> datetime | None:
+    """Return the time of the last diagnosed run of a robot (UTC)."""
+    of = sa.select(sa.func.max(diagnoses.c.at)).where(diagnoses.c.robot_id == robot)
+    return connection.scalar(of)
+
+
+def tracker_of(connection: sa.Connection, robot: int) -> EpisodeTracker:
+    """Return the tracker of a robot with its open episodes."""
+    return EpisodeTracker(
+        Course(
+            NamedFault(one.motor, one.mode, RAISED if one.raised else SUSPECTED),
+            one.since,
+            one.row,
+            one.refuted,
+        )
+        for one in read_episodes(connection, robot, episodes.c.until.is_(None))
+    )
+
+
+def keep_episodes(
+    connection: sa.Connection, robot: int, changed: Sequence[Course], rows: Sequence[int | None]
+) -> tuple[FaultEpisode, ...]:
+    """Write new and closed episodes and their events, and return these episodes.
+
+    `rows` are those of the diagnoses.
+    """
+    if not changed:
+        return ()
+    fresh = [course for course in changed if course.row is None]
+    added = iter(add_rows(connection, episodes, _new_episodes(connection, robot, fresh)))
+    known = {id(course): course.row or next(added) for course in changed}
+    for course in changed:
+        if course.row is not None and course.until is not None:
+            close = sa.update(episodes).where(episodes.c.id == course.row)
+            connection.execute(close.values(until=course.until))
+    events = [
+        {"episode_id": known[id(one)], "diagnosis_id": rows[number], "state": state, "at": at}
+        for one in changed
+        for state, at, number in one.events
+    ]
+    add_rows(connection, episode_events, events)
+    return read_episodes(connection, robot, episodes.c.id.in_(known.values()))
+
+
+def _new_episodes(
+    connection: sa.Connection, robot: int, fresh: Sequence[Course]
+) -> list[dict[str, Any]]:
+    if not fresh:
+        return []
+    last = sa.select(sa.func.max(episodes.c.number)).where(episodes.c.robot_id == robot)
+    first = (connection.scalar(last) or 0) + 1
+    return [
+        {
+            "robot_id": robot,
+            "number": number,
+            "motor": course.fault.motor,
+            "mode": course.fault.mode,
+            "since": course.since,
+            "until": course.until,
+        }
+        for number, course in enumerate(fresh, start=first)
+    ]

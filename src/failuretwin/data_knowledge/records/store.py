@@ -17,8 +17,6 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import sqlalchemy as sa
-
 from failuretwin import __version__
 from failuretwin.core.errors import InputError, check_name
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
@@ -36,18 +34,23 @@ from failuretwin.data_knowledge.records.history import (
     WRONG,
     FaultEpisode,
     StoredCalibration,
-    read_episodes,
 )
 from failuretwin.data_knowledge.records.log_files import LogFile, log_file, utc
 from failuretwin.data_knowledge.records.offsets import MotorOffset, add_offsets
 from failuretwin.data_knowledge.records.reading import StoreReader
-from failuretwin.data_knowledge.records.rows import Basis, SessionRows, add_rows
-from failuretwin.data_knowledge.records.schema import episodes, repairs
-from failuretwin.data_knowledge.records.sessions import Note, Session, follow_notes
-from failuretwin.data_knowledge.records.statements import (
-    add_finding,
-    replace_calibration,
-    withdraw_last_repair,
+from failuretwin.data_knowledge.records.schema import (
+    Basis,
+    SessionRows,
+    add_rows,
+    repairs,
+)
+from failuretwin.data_knowledge.records.sessions import (
+    Note,
+    Session,
+    follow_notes,
+    keep_episodes,
+    latest_run,
+    tracker_of,
 )
 from failuretwin.digital_model.robot import Robot
 
@@ -134,8 +137,8 @@ class Store(StoreReader):
             kept, seen = writing.new_diagnoses(connection, at, diagnoses, run_rows, calibration)
             if not kept:
                 return Remembered(0, len(diagnoses), ())
-            tracker = writing.tracker_of(connection, row)
-            if source.recorded >= (writing.latest_run(connection, row) or source.recorded):
+            tracker = tracker_of(connection, row)
+            if source.recorded >= (latest_run(connection, row) or source.recorded):
                 for number, (diagnosis, run, _) in enumerate(kept):
                     if run not in seen:
                         tracker.follow(diagnosis, source.recorded, number)
@@ -144,10 +147,8 @@ class Store(StoreReader):
             of = SessionRows(writing.add_session(connection, row, basis, states), row)
             rows = writing.add_diagnoses(connection, of, kept, source.recorded)
             add_offsets(connection, of, source.recorded, offsets)
-            changed = writing.keep_episodes(connection, row, tracker.changed, rows)
-            return Remembered(
-                len(kept), len(diagnoses) - len(kept), _episodes_of(connection, row, changed)
-            )
+            changed = keep_episodes(connection, row, tracker.changed, rows)
+            return Remembered(len(kept), len(diagnoses) - len(kept), changed)
 
     # Sessions.
 
@@ -299,7 +300,7 @@ class Store(StoreReader):
             "at": _or_now(at),
         }
         with self._database.writing() as connection:
-            return add_finding(connection, robot, episode, stated)
+            return writing.add_finding(connection, robot, episode, stated)
 
     def withdraw(
         self, robot: str, episode: int, *, person: str = "", note: str = ""
@@ -324,7 +325,7 @@ class Store(StoreReader):
             "at": _or_now(None),
         }
         with self._database.writing() as connection:
-            return add_finding(connection, robot, episode, stated, withdraw=True)
+            return writing.add_finding(connection, robot, episode, stated, withdraw=True)
 
     def repaired(
         self,
@@ -367,7 +368,7 @@ class Store(StoreReader):
             OutputError: If it could not be stored.
         """
         with self._database.writing() as connection:
-            withdraw_last_repair(connection, robot, motor, {"person": person, "note": note})
+            writing.withdraw_last_repair(connection, robot, motor, {"person": person, "note": note})
 
     # Calibrations.
 
@@ -400,7 +401,7 @@ class Store(StoreReader):
             row = writing.keep_robot(connection, robot, profile)
             stated = {"name": name, "protocol": protocol, "document": document}
             stated |= {"version": __version__, "sha256": writing.text_checksum(document)}
-            return replace_calibration(connection, row, stated, start)
+            return writing.replace_calibration(connection, row, stated, start)
 
 
 def open_store(url: str | Path, *, create: bool = False) -> Store:
@@ -450,9 +451,3 @@ def _details(runs: xr.Dataset | None, count: int) -> list[dict[str, float] | Non
         return [None] * count
     rate = measured_rate(runs)
     return [{"duration_s": float(one), "rate_hz": rate} for one in runs["duration"].values]
-
-
-def _episodes_of(
-    connection: sa.Connection, robot: int, changed: Sequence[int]
-) -> tuple[FaultEpisode, ...]:
-    return read_episodes(connection, robot, episodes.c.id.in_(changed)) if changed else ()

@@ -29,8 +29,7 @@ from scipy.special import expit, logsumexp
 
 from failuretwin.core.hypothesis import HEALTHY_STATE, Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.data_knowledge.records.rows import add_rows
-from failuretwin.data_knowledge.records.schema import diagnoses, residuals
+from failuretwin.data_knowledge.records.schema import add_rows, diagnoses, residuals
 
 LEAST_RUNS = 2
 """Runs without a healthy one between from which `unknown` is an episode: a fault stays, a false

@@ -6,7 +6,7 @@ import hashlib
 import json
 import tomllib
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -16,28 +16,32 @@ import sqlalchemy as sa
 from failuretwin import __version__
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.data_knowledge.records.episodes import (
-    RAISED,
-    SUSPECTED,
-    Course,
-    EpisodeTracker,
-    NamedFault,
+from failuretwin.data_knowledge.records.history import (
+    FaultEpisode,
+    StoredCalibration,
+    read_calibrations,
+    read_counts,
+    read_episodes,
 )
-from failuretwin.data_knowledge.records.history import read_counts, read_episodes
 from failuretwin.data_knowledge.records.log_files import LogFile
-from failuretwin.data_knowledge.records.rows import Basis, SessionRows, add_rows
 from failuretwin.data_knowledge.records.schema import (
+    STANDING,
+    Basis,
+    SessionRows,
+    add_rows,
+    calibrations,
     diagnoses,
-    episode_events,
-    episodes,
+    findings,
     logs,
     notes,
     profiles,
+    repairs,
     robots,
     runs,
     sensors,
     sessions,
     storable,
+    withdrawals,
 )
 from failuretwin.data_knowledge.records.unknown_faults import add_residuals
 from failuretwin.digital_model.arm_classes import class_name
@@ -291,67 +295,92 @@ def _diagnosis_row(diagnosis: Diagnosis, digest: str, at: datetime) -> dict[str,
     }
 
 
-# Episodes.
+# What people state, and calibrations that replace each other.
 
 
-def latest_run(connection: sa.Connection, robot: int) -> datetime | None:
-    """Return the time of the last diagnosed run of a robot (UTC)."""
-    of = sa.select(sa.func.max(diagnoses.c.at)).where(diagnoses.c.robot_id == robot)
-    return connection.scalar(of)
+def add_finding(
+    connection: sa.Connection,
+    robot: str,
+    number: int,
+    stated: Mapping[str, Any],
+    withdraw: bool = False,
+) -> FaultEpisode:
+    """Store a finding about an episode, or withdraw the last one; return the episode.
 
-
-def tracker_of(connection: sa.Connection, robot: int) -> EpisodeTracker:
-    """Return the tracker of a robot with its open episodes."""
-    return EpisodeTracker(
-        Course(
-            NamedFault(one.motor, one.mode, RAISED if one.raised else SUSPECTED),
-            one.since,
-            one.row,
-            one.refuted,
-        )
-        for one in read_episodes(connection, robot, episodes.c.until.is_(None))
-    )
-
-
-def keep_episodes(
-    connection: sa.Connection, robot: int, changed: Sequence[Course], rows: Sequence[int | None]
-) -> list[int]:
-    """Write new and closed episodes and their events; `rows` are those of the diagnoses.
-
-    Returns:
-        Rows of the episodes.
+    Raises:
+        InputError: If there is no such robot or episode, or no finding to withdraw.
     """
-    fresh = [course for course in changed if course.row is None]
-    added = iter(add_rows(connection, episodes, _new_episodes(connection, robot, fresh)))
-    known = {id(course): course.row or next(added) for course in changed}
-    for course in changed:
-        if course.row is not None and course.until is not None:
-            close = sa.update(episodes).where(episodes.c.id == course.row)
-            connection.execute(close.values(until=course.until))
-    events = [
-        {"episode_id": known[id(one)], "diagnosis_id": rows[number], "state": state, "at": at}
-        for one in changed
-        for state, at, number in one.events
-    ]
-    add_rows(connection, episode_events, events)
-    return list(known.values())
+    row = find_locked(connection, robot)
+    episode = _numbered(connection, row, robot, number)
+    standing = episode.finding if withdraw else None
+    if withdraw and standing is None:
+        raise InputError(
+            f"episode {number} of {robot!r} has no finding to withdraw. Expected one of "
+            "`failuretwin found`."
+        )
+    of = {"episode_id": episode.row, "withdraws": standing and standing.number}
+    add_rows(connection, findings, [{**stated, **of}])
+    return _numbered(connection, row, robot, number)
 
 
-def _new_episodes(
-    connection: sa.Connection, robot: int, fresh: Sequence[Course]
-) -> list[dict[str, Any]]:
-    if not fresh:
-        return []
-    last = sa.select(sa.func.max(episodes.c.number)).where(episodes.c.robot_id == robot)
-    first = (connection.scalar(last) or 0) + 1
-    return [
-        {
-            "robot_id": robot,
-            "number": number,
-            "motor": course.fault.motor,
-            "mode": course.fault.mode,
-            "since": course.since,
-            "until": course.until,
-        }
-        for number, course in enumerate(fresh, start=first)
-    ]
+def _numbered(connection: sa.Connection, row: int, robot: str, number: int) -> FaultEpisode:
+    all_of_it = read_episodes(connection, row)
+    found = next((one for one in all_of_it if one.number == number), None)
+    if found is None:
+        valid = ", ".join(str(one.number) for one in all_of_it) or "none so far"
+        raise InputError(f"robot {robot!r} has no episode {number}. Its episodes: {valid}.")
+    return found
+
+
+def withdraw_last_repair(
+    connection: sa.Connection, robot: str, motor: str, stated: Mapping[str, Any]
+) -> None:
+    """Take back the last repair of a motor that stands.
+
+    Raises:
+        InputError: If there is no such robot, or no repair of that motor.
+    """
+    row = find_locked(connection, robot)
+    query = sa.select(repairs.c.id).where(repairs.c.robot_id == row, STANDING)
+    query = query.where(repairs.c.motor == motor).order_by(repairs.c.id.desc()).limit(1)
+    last = connection.scalar(query)
+    if last is None:
+        raise InputError(
+            f"{motor} of {robot!r} has no repair to withdraw. Expected one of "
+            "`failuretwin repaired`."
+        )
+    add_rows(connection, withdrawals, [{**stated, "repair_id": last, "at": datetime.now(UTC)}])
+
+
+def calibration_in_force(connection: sa.Connection, robot: int) -> StoredCalibration | None:
+    """Return the calibration of a robot whose validity has no end; None: it has none."""
+    stored = read_calibrations(connection, robot)
+    return next((one for one in stored if one.valid_to is None), None)
+
+
+def replace_calibration(
+    connection: sa.Connection, robot: int, stated: Mapping[str, Any], start: datetime
+) -> StoredCalibration:
+    """Store a calibration that is valid from `start` on, and return the one in force.
+
+    Raises:
+        InputError: If the calibration in force is newer.
+    """
+    current = calibration_in_force(connection, robot)
+    if current is not None and current.document == stated["document"]:
+        return current
+    if current is not None:
+        _close(connection, current, start)
+    row = {**stated, "robot_id": robot, "valid_from": start}
+    add_rows(connection, calibrations, [row])
+    return read_calibrations(connection, robot)[-1]
+
+
+def _close(connection: sa.Connection, current: StoredCalibration, end: datetime) -> None:
+    if end < current.valid_from:
+        raise InputError(
+            f"calibration {current.name!r} is valid from {current.valid_from:%Y-%m-%d %H:%M}, "
+            f"after {end:%Y-%m-%d %H:%M}. Expected a later time."
+        )
+    row = calibrations.c.id == current.number
+    connection.execute(sa.update(calibrations).where(row).values(valid_to=end))

@@ -13,7 +13,7 @@ from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
 from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.benchmark.entries import diagnoses_of
+from failuretwin.decision.benchmark.tasks import diagnoses_of
 from failuretwin.decision.learned.feature_encoder import Signals, mean_lag_s, signals_of
 from failuretwin.digital_model.arm_classes import class_of, generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections

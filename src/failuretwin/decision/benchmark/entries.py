@@ -12,7 +12,7 @@ X is (run, 100 times channel): at each tenth of a second the commands [rad], the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -22,6 +22,7 @@ from failuretwin.core.errors import InputError, check_name, needs_extra
 from failuretwin.core.hypothesis import PAPER_MODES, Diagnosis, single_faults
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import FloatArray
+from failuretwin.decision.benchmark.tasks import diagnoses_of
 from failuretwin.decision.learned.feature_encoder import (
     augmented_features,
     original_features,
@@ -72,16 +73,6 @@ def features_of(runs: xr.Dataset, twin: DigitalTwin) -> FloatArray:
     beyond = augmented_features(twin, signals)[..., 3:]
     channels = np.concatenate([original_features(signals), beyond], axis=-1)
     return channels.reshape(len(channels), -1)
-
-
-def diagnoses_of(
-    runs: xr.Dataset, names: Sequence[str], chances: Iterable[Iterable[float]]
-) -> list[Diagnosis]:
-    """Return the diagnoses of runs by the probability of each class, (run, class)."""
-    return [
-        Diagnosis(str(run), dict(zip(names, row, strict=True)))
-        for run, row in zip(runs["run"].values, chances, strict=True)
-    ]
 
 
 class Classifier:

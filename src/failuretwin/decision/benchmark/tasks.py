@@ -6,8 +6,9 @@ is a question, scored on the answers to one or several cases.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from failuretwin.core.types import FloatArray
 from failuretwin.decision import scoring
 from failuretwin.decision.evaluation import Evaluation, Truths, evaluate
 from failuretwin.decision.results import Record
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 TRACKS = {
     "P0": "no data of the robot",
@@ -70,6 +74,16 @@ CASES: Mapping[str, Case] = {
 
 Answer = Diagnosis | Record
 Answers = Sequence[Answer]
+
+
+def diagnoses_of(
+    runs: xr.Dataset, names: Sequence[str], chances: Iterable[Iterable[float]]
+) -> list[Diagnosis]:
+    """Return the diagnoses of runs by the probability of each class, (run, class)."""
+    return [
+        Diagnosis(str(run), dict(zip(names, row, strict=True)))
+        for run, row in zip(runs["run"].values, chances, strict=True)
+    ]
 
 
 @dataclass(frozen=True)

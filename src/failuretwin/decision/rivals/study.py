@@ -20,8 +20,7 @@ from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import load_run_set, replacing, save_run_set, write_text
-from failuretwin.decision.benchmark.entries import diagnoses_of
-from failuretwin.decision.benchmark.tasks import PREFIXES_S, TASKS, Judgement
+from failuretwin.decision.benchmark.tasks import PREFIXES_S, TASKS, Judgement, diagnoses_of
 from failuretwin.decision.evaluation import Truths, compare, evaluate
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, signals_of
 from failuretwin.decision.learned.paper_study import (
