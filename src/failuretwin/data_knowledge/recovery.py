@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 
@@ -360,23 +360,21 @@ class _Run:
         return fit(guesses, self._part(m), self.twin, free, RAMP_STEPS, one_is_enough=True)
 
     def _joined(self, initial: FloatArray, ramps: Sequence[Movements]) -> Movements:
-        """Return one run from the pose `initial` (1, motor) with the movements of all ramps."""
+        """Return one run from the pose `initial` (1, motor) with the movements of all ramps.
+
+        Motors that stay have a duration of 0.
+        """
         none = Movements.empty(run=1, movement=0, motor=initial.shape[1])
         parts = [none, *ramps]
         target, duration, start = (
             np.concatenate([getattr(part, name) for part in parts], axis=1)
             for name in ("target", "ramp_duration", "start")
         )
-        return _without_idle_ramps(Movements(initial, target, duration, start))
+        poses = np.concatenate([initial[:, None], target], axis=1)
+        idle = np.abs(np.diff(poses, axis=1)) <= STAYS_RAD
+        return Movements(initial, target, np.where(idle, 0.0, duration), start)
 
 
 def _nearest_first(poses: FloatArray, to: FloatArray) -> IntArray:
     """Return the order of poses (pose, motor) by their distance from a pose."""
     return np.argsort(np.linalg.norm(poses - to, axis=1), kind="stable")
-
-
-def _without_idle_ramps(movements: Movements) -> Movements:
-    """Return the movements with a duration of 0 for motors that stay."""
-    poses = np.concatenate([movements.initial[:, None], movements.target], axis=1)
-    idle = np.abs(np.diff(poses, axis=1)) <= STAYS_RAD
-    return replace(movements, ramp_duration=np.where(idle, 0.0, movements.ramp_duration))

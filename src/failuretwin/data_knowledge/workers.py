@@ -97,7 +97,9 @@ class Workforce:
         with _silence(), _dask_client(self) as client:
             for path in plugin_files():
                 client.upload_file(str(path))
-            yield _results(client, deque(client.map(work, list(items), pure=False)))
+            futures = deque(client.map(work, list(items), pure=False))
+            # They are dropped with their results, to free memory.
+            yield (_result(client, futures.popleft()) for _ in range(len(futures)))
 
 
 ONE_PROCESS = Workforce()
@@ -153,12 +155,6 @@ def _connected(scheduler: str) -> Client:
 def _reason(error: BaseException) -> str:
     """Return the message of an error of Dask, on one line."""
     return " ".join(str(error).split()) or type(error).__name__
-
-
-def _results(client: Client, futures: deque[Future[Result]]) -> Iterator[Result]:
-    """Yield the results in order; futures are dropped with their results, to free memory."""
-    while futures:
-        yield _result(client, futures.popleft())
 
 
 def _result(client: Client, future: Future[Result]) -> Result:

@@ -49,7 +49,9 @@ def read_topics(path: Path) -> list[BagTopic]:
     Raises:
         InputError: If it cannot be read or rosbags is not installed.
     """
-    _check_installed(path)
+    with needs_extra(f"{path}: ROS bags need rosbags", "files"):
+        import rosbags.rosbag1
+        import rosbags.rosbag2  # noqa: F401
     with _guarded(path):
         for file in [path] if path.is_file() else filter(Path.is_file, path.iterdir()):
             check_recording(file)
@@ -76,12 +78,6 @@ def read_messages(path: Path, names: Sequence[str]) -> dict[str, list[BagMessage
             content = decode(raw, connection.msgtype)
             messages[connection.topic].append(BagMessage(received_ns, content))
     return messages
-
-
-def _check_installed(path: Path) -> None:
-    with needs_extra(f"{path}: ROS bags need rosbags", "files"):
-        import rosbags.rosbag1
-        import rosbags.rosbag2  # noqa: F401
 
 
 def _guarded(path: Path) -> AbstractContextManager[None]:

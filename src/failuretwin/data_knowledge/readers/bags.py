@@ -186,9 +186,10 @@ class _Recording:
         return topic_rows(self.messages[topic.name], kind, role, where, self.robot)
 
     def _is_ours(self, topic: BagTopic, rows: Rows, role: Role) -> bool:
-        """Return whether a topic tells of this robot; transforms may be of anything."""
+        """Return whether a topic names a motor of this robot; transforms may be of anything."""
         if role != "tool":
-            return _names_a_motor(rows.names, self.robot)
+            schemes = _schemes(self.robot, in_counts=False).values()
+            return any(set(scheme) & set(rows.names) for scheme in schemes)
         return topic.kind is not Kind.TRANSFORMS or len(rows.stamp_ns) > 0
 
 
@@ -225,11 +226,6 @@ def motor_rows(rows: Rows, robot: Robot) -> Rows:
     duration = None if rows.duration is None else rows.duration[:, columns]
     motors = Rows(rows.where, rows.stamp_ns, angle, tuple(robot.motor_names), duration)
     return motors.take(np.asarray(np.isfinite(angle).any(axis=1)))
-
-
-def _names_a_motor(names: Sequence[str], robot: Robot) -> bool:
-    """Return whether any of the names can stand for a motor of the robot."""
-    return any(set(scheme) & set(names) for scheme in _schemes(robot, in_counts=False).values())
 
 
 def _motor_columns(rows: Rows, robot: Robot) -> list[int]:

@@ -151,7 +151,8 @@ def _recovered(paths: Sequence[_Paths], robot: Robot) -> RunTable:
 def _pair_run(run: _Paths, hidden: Path, path: Path, robot: Robot) -> RunTable:
     """Return the run of a pair, with the commands and responses in its hidden half."""
     time, command, response_time, response = _hidden(hidden, len(robot.motors))
-    if len(command) != len(run.desired) or not _same_path(command, run.desired, robot):
+    same = len(command) == len(run.desired)
+    if not same or np.abs(DigitalTwin(robot).path(command) - run.desired).max() >= SAME_PATH_M:
         raise InputError(f"{path}: its desired path is not that of the commands in {hidden.name}.")
     late = round((response_time[0] - time[0]) / (time[1] - time[0]))
     drawn_out = np.mean(np.abs(np.diff(response, 2, axis=0)).max(axis=1) > 1e-9) < 0.5
@@ -164,10 +165,6 @@ def _pair_run(run: _Paths, hidden: Path, path: Path, robot: Robot) -> RunTable:
         robot,
     )
     return replace(table, command=command[None], position=_later(response, late)[None])
-
-
-def _same_path(command: FloatArray, desired: FloatArray, robot: Robot) -> bool:
-    return bool(np.abs(DigitalTwin(robot).path(command) - desired).max() < SAME_PATH_M)
 
 
 def _later(values: FloatArray, samples: int) -> FloatArray:

@@ -133,7 +133,10 @@ def _unknown(connection: sa.Connection, now: datetime, days: float) -> list[tupl
 
 def _by_age(connection: sa.Connection, now: datetime, days: float) -> list[tuple[Any, ...]]:
     return [
-        (kind, motor, _ages(band), round(band.hours / 24.0, 3), count, _per_1000_h(band, count))
+        (
+            *(kind, motor, _ages(band), round(band.hours / 24.0, 3), count),
+            1000.0 * count / band.hours if band.hours else None,
+        )
         for kind in sorted(watched_days(connection))
         for motor, bands in fleet_faults(connection, kind).by_age.items()
         for band in bands
@@ -145,10 +148,6 @@ def _ages(band: AgeBand) -> str:
     """Return the ages of a band in words."""
     low, high = band.low_h / 24.0, band.high_h / 24.0
     return f"from {low:g}" if math.isinf(high) else f"{low:g} to {high:g}"
-
-
-def _per_1000_h(band: AgeBand, count: int) -> float | None:
-    return 1000.0 * count / band.hours if band.hours else None
 
 
 @dataclass(frozen=True)

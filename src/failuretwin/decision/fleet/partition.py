@@ -233,21 +233,17 @@ class Partition:
             self.remarks[robot] = text
 
     def _announce(self, message: Envelope) -> None:
-        """Take in a profile; the same once more changes nothing."""
+        """Take in a profile; the same once more changes nothing, another makes another robot."""
         found = parse_profile(message.data)
         self._resolve(found)
         self.announced[message.robot] = found
         self.remarks.pop(message.robot, None)
         known = self._robots.get(message.robot)
         if known is not None and known.kind != fingerprint(found):
-            self._flush_leaver(known)
+            group = self._groups[known.kind]
+            group.pending.pop(known.row, None)
+            group.names[known.row] = ""
             del self._robots[message.robot]
-
-    def _flush_leaver(self, robot: _Robot) -> None:
-        """Drop what waits of a robot that becomes another."""
-        group = self._groups[robot.kind]
-        group.pending.pop(robot.row, None)
-        group.names[robot.row] = ""
 
     def _hear(self, message: Envelope) -> None:
         robot = self._robots.get(message.robot)

@@ -204,12 +204,18 @@ class _Trainer:
 
     def trained(self, learn: Batch, target: Floats) -> Any:
         """Return a trained network, stored unless it adapts; fine-tuning goes on from the CNN."""
-        from failuretwin.decision.learned.networks import adversarial_training
+        import torch
 
-        network, batches = self._new(learn, len(class_names(self.robot)))
+        from failuretwin.decision.learned import networks as own
+
+        torch.manual_seed(int(self.rng.integers(2**31)))
+        kind = self.job.method if self.job.method in NETWORKS else "cnn"
+        classes = len(class_names(self.robot))
+        network: Any = own.build_network(kind, learn[0].shape[2], classes)
+        batches = own.shuffled_batches(*learn, BATCH_RUNS, self.rng)
         if self.job.method == "dann":
             steps = self.plan.iterations, RATE
-            run = adversarial_training(network, batches, target, *steps, self.rng)
+            run = own.adversarial_training(network, batches, target, *steps, self.rng)
             deque(in_bfloat16(run), maxlen=0)
             return network
         return self._kept(network, batches)
@@ -230,17 +236,6 @@ class _Trainer:
         with replacing(stored) as new:
             torch.save(network.state_dict(), new)
         return network
-
-    def _new(self, learn: Batch, classes: int) -> tuple[Any, Iterator[Batch]]:
-        """Return a network with random weights, and its batches."""
-        import torch
-
-        from failuretwin.decision.learned import networks as own
-
-        torch.manual_seed(int(self.rng.integers(2**31)))
-        kind = self.job.method if self.job.method in NETWORKS else "cnn"
-        network = own.build_network(kind, learn[0].shape[2], classes)
-        return network, own.shuffled_batches(*learn, BATCH_RUNS, self.rng)
 
     def fine_tuned(self, network: Any, target: Floats, truth: IntArray) -> Answer:
         """Return the logits of each fold by a network that went on learning on the others.
