@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from failuretwin import __version__
 from failuretwin.core.errors import InputError, check_name
@@ -292,13 +292,7 @@ class Store(StoreReader):
         check_name("finding", verdict, VERDICTS)
         if verdict == OTHER_CAUSE and not cause:
             raise InputError("an other cause has no name. State the cause that was found.")
-        stated = {
-            "verdict": verdict,
-            "cause": cause,
-            "person": person,
-            "note": note,
-            "at": _or_now(at),
-        }
+        stated = _stated(at, verdict=verdict, cause=cause, person=person, note=note)
         with self._database.writing() as connection:
             return writing.add_finding(connection, robot, episode, stated)
 
@@ -317,13 +311,7 @@ class Store(StoreReader):
             InputError: If there is no such robot or episode, or no finding that stands.
             OutputError: If it could not be stored.
         """
-        stated = {
-            "verdict": "withdrawn",
-            "cause": "",
-            "person": person,
-            "note": note,
-            "at": _or_now(None),
-        }
+        stated = _stated(None, verdict="withdrawn", cause="", person=person, note=note)
         with self._database.writing() as connection:
             return writing.add_finding(connection, robot, episode, stated, withdraw=True)
 
@@ -356,9 +344,8 @@ class Store(StoreReader):
             motors = writing.motors_of(connection, row)
             if motors:
                 check_name("motor", motor, motors)
-            stated = {"motor": motor, "part": part, "person": person, "note": note}
-            when = {"robot_id": row, "at": _or_now(at)}
-            add_rows(connection, repairs, [{**stated, **when}])
+            stated = _stated(at, motor=motor, part=part, person=person, note=note)
+            add_rows(connection, repairs, [{**stated, "robot_id": row}])
 
     def withdraw_repair(self, robot: str, motor: str, *, person: str = "", note: str = "") -> None:
         """Take back the last repair of a motor; both stay in the store.
@@ -440,6 +427,11 @@ def _reference(log: LogFile | str | Path | None) -> LogFile:
             "later logs would count as older. State the right one: --recorded TIME."
         )
     return found
+
+
+def _stated(at: datetime | None, **columns: str) -> dict[str, Any]:
+    """Return the columns of what a person states at a time (UTC); None: now."""
+    return {**columns, "at": _or_now(at)}
 
 
 def _or_now(time: datetime | None) -> datetime:

@@ -27,7 +27,7 @@ from failuretwin.core.config import fingerprint, from_table
 from failuretwin.core.errors import FailureTwinError, InputError, OutputError, counted, reason
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import check_motors, truth_of
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import SUFFIXES, replacing, write_text
@@ -283,15 +283,20 @@ def _standardised_sets(path: Path, rng: np.random.Generator) -> dict[str, tuple[
     with np.load(path, allow_pickle=False) as stored:
         simulated, truth = stored["simulated"], stored["simulated_class"]
         test = stored["test"], stored["test_class"]
-    order = rng.permutation(len(simulated))
-    held_out = round(VALIDATION_SHARE * len(order))
-    validation, learning = order[:held_out], order[held_out:]
+    validation, learning = held_out(len(simulated), rng)
     standard = Standard.of(simulated[learning])
     return {
         "training": (standard(simulated[learning]), truth[learning]),
         "validation": (standard(simulated[validation]), truth[validation]),
         "test": (standard(test[0]), test[1]),
     }
+
+
+def held_out(runs: int, rng: np.random.Generator) -> tuple[IntArray, IntArray]:
+    """Return which runs are held out for validation, and which are learned from."""
+    order = rng.permutation(runs)
+    held = round(VALIDATION_SHARE * runs)
+    return order[:held], order[held:]
 
 
 def _file(folder: Path, job: Job) -> Path:

@@ -17,8 +17,8 @@ from failuretwin.data_knowledge.store import load_run_set, replacing
 from failuretwin.decision.learned.feature_encoder import Floats
 from failuretwin.decision.learned.paper_study import (
     BATCH_RUNS,
-    VALIDATION_SHARE,
     class_names,
+    held_out,
     in_bfloat16,
 )
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
@@ -129,9 +129,7 @@ def by_training(
     rng = np.random.default_rng([plan.seed, job.repeat])
     with np.load(folder / f"{job.twin}.npz", allow_pickle=False) as stored:
         features, classes, target = stored["features"], stored["classes"], stored["test"]
-    order = rng.permutation(len(features))
-    held = round(VALIDATION_SHARE * len(order))
-    learn, judge = order[held:], order[:held]
+    judge, learn = held_out(len(features), rng)
     standard = Standard.of(features[learn])
     features, target = standard(features), standard(target)
     logits: Callable[[Floats], FloatArray]
@@ -166,13 +164,13 @@ def by_own_network(
     from failuretwin.decision.learned.moment_encoder import MomentEncoder
 
     runs = load_run_set(folder / LEARNT)
-    order = np.random.default_rng([plan.seed, job.repeat]).permutation(runs.sizes["run"])
-    held = round(VALIDATION_SHARE * len(order))
+    rng = np.random.default_rng([plan.seed, job.repeat])
+    judge, learn = held_out(runs.sizes["run"], rng)
     encoder = MomentEncoder(known.robot, known.imperfections)
     network = MotorwiseDiagnoser(
         encoder, iterations=plan.iterations, batch_runs=BATCH_RUNS, random_state=job.repeat
     )
-    network.fit(runs.isel(run=order[held:])).calibrate(runs.isel(run=order[:held]))
+    network.fit(runs.isel(run=learn)).calibrate(runs.isel(run=judge))
     places = [network.classes_.tolist().index(name) for name in class_names(known.robot)]
     return lambda view: network.predict_proba(views[view])[:, places]
 

@@ -40,6 +40,8 @@ from failuretwin.inference.posterior import Posterior
 
 SIZES = 3
 """Sizes of each fault that are laid beside each other."""
+LEVELS = tuple((k + 0.5) / SIZES for k in range(SIZES))
+"""Quantiles at which sizes are taken."""
 HELD = 4
 """Ways in which a motor may be held unseen: at the median of what it was told, always; where it was
 told to be first, half way, or last but one, from then on."""
@@ -133,13 +135,9 @@ def _at_quantiles(
         if share < NEGLIGIBLE or not hypothesis.known or len(hypothesis.faults) > 1:
             continue
         size = size_of(at)
-        sizes = [np.nan] if size is None else size.quantiles(tuple(_levels(SIZES).tolist()))
+        sizes = [np.nan] if size is None else size.quantiles(LEVELS)
         members += [Member(hypothesis, float(each), share / len(sizes)) for each in sizes]
     return members
-
-
-def _levels(count: int) -> FloatArray:
-    return (np.arange(count) + 0.5) / count
 
 
 @dataclass(frozen=True)
