@@ -189,14 +189,6 @@ def faults_at_rest(model: HealthyModel) -> tuple[Hypothesis, ...]:
     return shown_faults(model, [name for name, mode in MODES.items() if mode.signature in shown])
 
 
-def judged(
-    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
-) -> Posterior:
-    """Return the posterior of runs, with what is doubted of the arm integrated out."""
-    in_doubt = sensor_in_doubt(likelihood, hypotheses, priors)
-    return run_posterior(likelihood, hypotheses, priors, in_doubt)
-
-
 MOST_RUNS = 3
 """Runs of a log whose motions are examined, evenly spread."""
 RANDOM_S = 20.0
@@ -352,9 +344,13 @@ class Checking:
             yield order
 
     def _found(self, window: Sequence[Seen], further: int = 0) -> tuple[CheckResult, Posterior]:
-        """Return the result of movements, and the posterior of all hypotheses."""
+        """Return the result of movements, and the posterior of all hypotheses.
+
+        What is doubted of the arm is integrated out.
+        """
         likelihood = RunLikelihood(settled_evidence_of([window]), self.model)
-        posterior = judged(likelihood, self.hypotheses, self.priors)
+        weighed = likelihood, self.hypotheses, self.priors
+        posterior = run_posterior(*weighed, sensor_in_doubt(*weighed))
         diagnosis = posterior.to_diagnosis(0, "check", LogQuality())
         return self._result(likelihood, diagnosis, further), posterior
 
