@@ -20,6 +20,7 @@ from failuretwin.app.reports.study_page import (
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import save_run_set
+from failuretwin.decision.learned import paper_study
 from failuretwin.decision.learned.paper_study import (
     FEATURES,
     PLAN_FILE,
@@ -41,6 +42,11 @@ from failuretwin.decision.learned.paper_study import (
 from waiting import WAIT_S, wait_for, workers_of
 
 TINY = StudyPlan(0, 3, (2, 4), 1, 1)
+ENDLESS = """from failuretwin.app.cli import main
+from failuretwin.decision.learned import paper_study
+paper_study.quick_plan = lambda seed: paper_study.StudyPlan(seed, 3, (10**6,), 2, 1)
+main()"""
+"""The command line, with a small study whose trainings do not end."""
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +59,9 @@ def studied(armpi, exam, tmp_path_factory):
     """A tiny study, and how much of it was told as progress."""
     folder = tmp_path_factory.mktemp("study") / "out"
     told = []
-    trainings = run_study(TINY, armpi, exam, folder, told.append)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "cpu_count", lambda: 1)  # each process imports all libraries
+        trainings = run_study(TINY, armpi, exam, folder, told.append)
     write_study_page(trainings, TINY, armpi, exam, folder)
     return folder, sum(told)
 
@@ -124,7 +132,15 @@ def test_everything_is_on_the_page(studied):
     assert sorted(p.name for p in folder.iterdir()) == ["index.html", "study.json", "trainings"]
 
 
-def test_what_is_done_is_not_done_again(armpi, exam, studied):
+def here(work, jobs, on_progress):
+    """Run jobs in this process."""
+    for job in jobs:
+        work(job)
+        on_progress(1)
+
+
+def test_what_is_done_is_not_done_again(armpi, exam, studied, monkeypatch):
+    monkeypatch.setattr(paper_study, "spread", here)
     folder, _ = studied
     work = folder / WORK
     one, *others = sorted(work.glob("*.json"))
@@ -181,7 +197,7 @@ def test_the_command_refuses_a_folder_that_is_taken(studied, tmp_path):
 def test_an_interrupt_ends_the_trainings_and_what_was_begun_goes_on(tmp_path):
     """Also those that wait for their turn, and also if Ctrl-C reaches every process."""
     folder = tmp_path / "study"
-    command = [sys.executable, "-m", "failuretwin", "study", "--quick", "--out", str(folder)]
+    command = [sys.executable, "-c", ENDLESS, "study", "--quick", "--out", str(folder)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
     wait_for(lambda: any(one.cpu_times().user > 2.0 for one in workers_of(process.pid)))
     os.killpg(process.pid, signal.SIGINT)
