@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
-import subprocess
-import sys
 import threading
 import time
 from contextlib import contextmanager
 
+from executed import command_line
 from failuretwin.app.fleet import resolver
 from failuretwin.connection.fleet.broker import (
     ALARM_STREAM,
@@ -108,13 +106,8 @@ def worker_thread(url, name="inside", retain=None, access=None):
 
 def start(log, *words):
     """Start the command line in a process of its own, whose output goes to a file."""
-    with log.open("wb") as out:
-        return subprocess.Popen(
-            [sys.executable, "-m", "failuretwin", *words],
-            stdout=out,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, "PYTHONUNBUFFERED": "1"},
-        )
+    log.touch()
+    return command_line().begin(*words, out=log)
 
 
 def start_worker(server, name, *more):

@@ -21,6 +21,12 @@ def failuretwin():
 
 
 @pytest.fixture(scope="session")
+def begin():
+    """Begin a command, and do not wait for it."""
+    return command_line().begin
+
+
+@pytest.fixture(scope="session")
 def write_session():
     """Write a session of five movements of a healthy arm; its readings end at `until_s`."""
 

@@ -1,10 +1,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pandas as pd
@@ -346,19 +343,12 @@ def test_without_a_terminal_there_is_neither_colour_nor_progress(results):
     assert widest > 100, "sentences are cut to the width of a terminal that is not there"
 
 
-def test_output_may_be_cut_off_by_the_next_command(simulated):
+def test_output_may_be_cut_off_by_the_next_command(begin, simulated):
     """As in `failuretwin diagnose RUNS | head -1`."""
-    command = [sys.executable, "-u", "-m", "failuretwin", "diagnose", str(simulated)]
-    command += ["--hypotheses", "healthy"]
-    read, write = os.pipe()
-    os.close(read)
-    try:
-        answer = subprocess.run(
-            command, stdout=write, stderr=subprocess.PIPE, text=True, check=False
-        )
-    finally:
-        os.close(write)
-    assert "Traceback" not in answer.stderr
+    with begin("diagnose", simulated, "--hypotheses", "healthy") as answer:
+        answer.stdout.close()
+        errors = answer.stderr.read()
+    assert "Traceback" not in errors
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pandas as pd
@@ -91,21 +89,15 @@ cli.main()
 """
 
 
-def test_an_interrupt_ends_the_workers_and_leaves_no_netcdf(tmp_path):
-    command = [sys.executable, "-c", TELL_PROGRESS, "simulate", "--runs-per-class", "40"]
-    process = subprocess.Popen(
-        [*command, "--workers", "2", "--out", "runs.nc"],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-    )
-    assert process.stdout.readline() == b"100\n"  # the first piece is done
+def test_an_interrupt_ends_the_workers_and_leaves_no_netcdf(begin, tmp_path):
+    words = ("simulate", "--runs-per-class", 40, "--workers", 2, "--out", "runs.nc")
+    process = begin(*words, folder=tmp_path, code=TELL_PROGRESS)
+    assert process.stdout.readline() == "100\n"  # the first piece is done
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=WAIT_S)
 
     assert process.returncode != 0
-    assert b"Traceback" not in errors
+    assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []
 
 

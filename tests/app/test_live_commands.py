@@ -3,8 +3,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -93,7 +91,7 @@ def test_an_emulated_robot_has_a_fault_of_a_size_that_begins_at_a_time(failuretw
     assert found and float(found[1]) == pytest.approx(np.degrees(0.1), abs=0.4)
 
 
-def test_a_robot_on_a_ros_network_is_watched(roscore):
+def test_a_robot_on_a_ros_network_is_watched(roscore, begin):
     """Three programs on a real roscore: a robot, its shadow, and one that reads /diagnostics."""
     environment = {
         **os.environ,
@@ -102,31 +100,19 @@ def test_a_robot_on_a_ros_network_is_watched(roscore):
     peer = RosPeer(roscore.environment)
     topic = {"topic": "/diagnostics"}
     peer.ask(op="listen", type="diagnostic_msgs/DiagnosticArray", **topic)
-    command = [sys.executable, "-m", "failuretwin"]
-    robot = subprocess.Popen(
-        [*command, "emulate", "--speed", "5", "--fault", "motor_3:stuck@20"],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    words = ("emulate", "--speed", 5, "--fault", "motor_3:stuck@20")
+    robot = begin(*words, environment=environment)
     try:
-        answer = subprocess.run(
-            [*command, "watch", "ros1", "--seconds", "14"],
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=WAIT_S,
-            check=False,
-        )
+        with begin("watch", "ros1", "--seconds", 14, environment=environment) as answer:
+            stdout, stderr = answer.communicate()
     finally:
         robot.terminate()
         said, wrong = robot.communicate(timeout=WAIT_S)
         messages = peer.ask(op="heard", **topic)
         peer.close()
-    assert answer.returncode == 0, answer.stderr
+    assert answer.returncode == 0, stderr
     assert "motor_3:stuck" in said, wrong
-    assert any(text.startswith("ALARM: motor 3 stuck") for _, text in told(answer))
+    assert any(text.startswith("ALARM: motor 3 stuck") for _, text in TOLD.findall(stdout))
     assert len(messages) > 1
     levels = [{s["name"]: s["level"] for s in message["statuses"]} for message in messages]
     assert any(at["failuretwin: motor_3"] == at["failuretwin: arm"] == 2 for at in levels)
@@ -181,10 +167,9 @@ def test_a_recording_is_not_overwritten(failuretwin, tmp_path):
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_ends_the_watch_and_the_recording(recording, tmp_path, how):
+def test_an_interrupt_ends_the_watch_and_the_recording(begin, recording, tmp_path, how):
     path = tmp_path / "live.mcap"
-    command = [sys.executable, "-m", "failuretwin", "watch", recording, "--record", path]
-    shadow = subprocess.Popen([*command, "--speed", "4"], stdout=subprocess.PIPE, text=True)
+    shadow = begin("watch", recording, "--record", path, "--speed", 4)
     assert "healthy behaviour: armpi_fpv" in shadow.stdout.readline()
     assert "healthy" in shadow.stdout.readline()  # the first answer
     shadow.send_signal(how)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
@@ -42,13 +40,9 @@ def test_two_workers_write_the_same_bytes(failuretwin, tmp_path, made_by_one):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_interrupted_work_is_kept_and_continued(failuretwin, tmp_path, made_by_one, workers):
+def test_interrupted_work_is_kept_and_continued(failuretwin, begin, tmp_path, made_by_one, workers):
     arguments = [*COMMAND, tmp_path / "runs.zarr"]
-    words = [*arguments, "--workers", workers]
-    command = [sys.executable, "-m", "failuretwin", *map(str, words)]
-    with subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
-    ) as process:
+    with begin(*arguments, "--workers", workers) as process:
         while len(list(tmp_path.glob(".*.partial/done/*"))) < 2:
             assert process.poll() is None
             time.sleep(0.005)

@@ -4,8 +4,6 @@ import json
 import math
 import os
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -194,11 +192,10 @@ def test_the_command_refuses_a_folder_that_is_taken(studied, tmp_path):
         run("--out", tmp_path / "mine.txt", "--resume")
 
 
-def test_an_interrupt_ends_the_trainings_and_what_was_begun_goes_on(tmp_path):
+def test_an_interrupt_ends_the_trainings_and_what_was_begun_goes_on(begin, tmp_path):
     """Also those that wait for their turn, and also if Ctrl-C reaches every process."""
     folder = tmp_path / "study"
-    command = [sys.executable, "-c", ENDLESS, "study", "--quick", "--out", str(folder)]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
+    process = begin("study", "--quick", "--out", folder, code=ENDLESS, out=os.devnull)
     wait_for(lambda: any(one.cpu_times().user > 2.0 for one in workers_of(process.pid)))
     os.killpg(process.pid, signal.SIGINT)
     assert process.wait(WAIT_S) == 1

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +11,7 @@ import numpy as np
 import pytest
 from worn_robot import CALIBRATION, life, seen, truth
 
+from executed import command_line
 from failuretwin.connection.tracked_diagnosis import (
     History,
     history_path,
@@ -91,6 +89,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from failuretwin import load_robot
+sys.path[:0] = sys.argv[2:]
 from test_life_history import go_on, seen, truth
 robot = load_robot("armpi_fpv")
 evidence = seen(robot, truth(4), 3)
@@ -101,15 +100,12 @@ while True:
 
 
 def test_a_writer_that_is_killed_does_no_harm(armpi, calibration):
-    folders = [str(Path(__file__).parent), *sys.path]
-    writer = subprocess.Popen(
-        [sys.executable, "-c", WRITER, str(calibration)],
-        stdout=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(folders)},
-    )
+    here = Path(__file__).parent
+    folders = here, here.parent, here.parents[1] / "docs"
+    writer = command_line().begin(calibration, *folders, code=WRITER)
     path = history_path(calibration)
     with writer:
-        assert writer.stdout.readline() == b"ready\n"
+        assert writer.stdout.readline() == "ready\n"
         while not path.exists() or path.read_bytes().count(b"\n") < 4:
             assert writer.poll() is None
             time.sleep(0.001)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from executed import command_line
 from failuretwin import read_runs
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
@@ -289,8 +290,8 @@ with sole_writer(Path(sys.argv[1])):
 
 def test_two_processes_cannot_write_the_same_run_set(tmp_path, imperfect):
     path = tmp_path / "runs.zarr"
-    with subprocess.Popen([sys.executable, "-c", HOLD, path], stdout=subprocess.PIPE) as holder:
-        assert holder.stdout.readline() == b"held\n"
+    with command_line().begin(path, code=HOLD) as holder:
+        assert holder.stdout.readline() == "held\n"
         with pytest.raises(OutputError, match=rf"process {holder.pid} on .* is writing it"):
             produce(imperfect, path)
         assert listing(tmp_path) == [".runs.zarr.lock"]
@@ -378,7 +379,7 @@ produce(plan, Path(sys.argv[1]), chunk_runs=4)
 def test_killed_process_loses_at_most_the_piece_in_hand(monkeypatch, tmp_path, imperfect):
     plan = replace(imperfect, runs_per_class=6)
     path = tmp_path / "runs.zarr"
-    with subprocess.Popen([sys.executable, "-c", KILL, path]) as process:
+    with command_line().begin(path, code=KILL) as process:
         while len(list(tmp_path.glob(".runs.zarr.*.partial/done/*"))) < 5:
             assert process.poll() is None
             time.sleep(0.005)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import sys
 import time
 
 import psutil
 import pytest
 
+from executed import command_line
 from failuretwin.core.errors import FailureTwinError, InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge import workers as dask_workers
@@ -219,7 +219,7 @@ produce(plan, Path(sys.argv[1]), Workforce(2), chunk_runs=4)
 def test_killed_worker_is_replaced(tmp_path, made_by_one):
     path = tmp_path / "two.zarr"
     marks = ".two.zarr.*.partial/done/*"
-    with subprocess.Popen([sys.executable, "-c", PRODUCE, path], stderr=subprocess.PIPE) as process:
+    with command_line().begin(path, code=PRODUCE) as process:
         while not list(tmp_path.glob(marks)):
             assert process.poll() is None
             time.sleep(0.002)
@@ -227,7 +227,7 @@ def test_killed_worker_is_replaced(tmp_path, made_by_one):
         workers[0].kill()
         done_at_kill = len(list(tmp_path.glob(marks)))
         assert process.wait(WAIT_S) == 0
-        assert b"Traceback" not in process.stderr.read()
+        assert "Traceback" not in process.stderr.read()
     assert len(workers) == 2
     assert 0 < done_at_kill < 12
     assert contents(path) == made_by_one
@@ -236,7 +236,7 @@ def test_killed_worker_is_replaced(tmp_path, made_by_one):
 
 def test_workers_do_not_outlive_a_killed_parent(tmp_path):
     path = tmp_path / "runs.zarr"
-    with subprocess.Popen([sys.executable, "-c", PRODUCE, path], stderr=subprocess.DEVNULL) as one:
+    with command_line().begin(path, code=PRODUCE) as one:
         while not list(tmp_path.glob(".runs.zarr.*.partial/done/*")):
             assert one.poll() is None
             time.sleep(0.002)

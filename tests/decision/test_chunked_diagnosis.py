@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 
@@ -14,6 +12,7 @@ import pandas as pd
 import pytest
 
 import failuretwin as ft
+from executed import command_line
 from failuretwin.core import foreign
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.data_knowledge import run_pieces
@@ -252,8 +251,7 @@ diagnose_to_parquet(runs, bayes, Path(sys.argv[2]))
 
 def test_killed_work_goes_on(tmp_path, zarr, bayes, results):
     out = tmp_path / "out"
-    command = [sys.executable, "-c", KILLED, str(zarr), str(out)]
-    with subprocess.Popen(command) as process:
+    with command_line().begin(zarr, out, code=KILLED) as process:
         while process.poll() is None and not list(tmp_path.glob(".out.*.partial/done/1")):
             time.sleep(0.005)
         process.send_signal(signal.SIGKILL)
