@@ -58,11 +58,11 @@ def simulated(armpi):
     plan = Plan(
         armpi,
         [Hypothesis.parse("healthy", armpi.motor_names)],
-        12,
+        6,
         seed=3,
         imperfections=load_calibration(None, armpi).imperfections,
     )
-    return simulate_runs(plan, range(12)).movements
+    return simulate_runs(plan, range(6)).movements
 
 
 def movements(armpi, counts, start, ramp=0.8):
@@ -144,7 +144,7 @@ def test_time_bases_are_the_published_ones():
 
 @pytest.mark.parametrize("kind", ["noise", "offset", "glitch", "bump"])
 def test_a_spoilt_path_is_refused_by_name(simulated, armpi, twin, kind):
-    desired = twin.path(simulated.reference(FROM_ZERO))[:3]
+    desired = twin.path(simulated.reference(FROM_ZERO))[:2]
     spoilt = np.zeros((1000, 3))
     if kind == "noise":
         spoilt = 1e-3 * np.random.default_rng(0).standard_normal((1000, 3))
