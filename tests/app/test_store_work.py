@@ -6,10 +6,7 @@ import io
 import json
 import os
 import shutil
-import signal
 import sqlite3
-import subprocess
-import sys
 import threading
 import time
 from contextlib import closing, suppress
@@ -30,7 +27,7 @@ from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from store_places import diagnosis
 
 NAME = ("--robot-name", "arm_7")
-FAULT = ("--fault", "motor_3:stuck@20-40")
+FAULT = ("--fault", "motor_3:stuck@10-18")
 AMONG = ("--hypotheses", "healthy,motor_1:stuck,motor_2:stuck")
 """Where what is learned does not depend on what else is offered."""
 on_sqlite = pytest.mark.parametrize("place", ["sqlite"], indirect=True)
@@ -80,7 +77,7 @@ def texts(history, kind):
 @on_postgresql
 def test_work_of_every_command_is_in_the_history(run, store, place, calibrated, tmp_path):
     words = ("--store", place.url, *NAME)
-    watch = run("watch", "emulated", "--speed", 0, "--seconds", 55, *FAULT, *words)
+    watch = run("watch", "emulated", "--speed", 0, "--seconds", 30, *FAULT, *words)
     assert FOUND in watch.stderr
     lines = [line.partition(" s  ")[2] for line in watch.stdout.splitlines() if " s  " in line]
     stored = texts(store.history("arm_7"), "watch")
@@ -143,15 +140,14 @@ def test_a_check_that_was_recorded_is_stored_with_its_log(run, store, place, stu
 
 
 @on_postgresql
-def test_what_a_killed_watch_has_told_is_stored(store, place, tmp_path):
-    command = [sys.executable, "-m", "failuretwin", "watch", "emulated", "--speed", "0"]
-    command += [*FAULT, "--store", place.url, *NAME]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as child:
+def test_what_a_killed_watch_has_told_is_stored(begin, store, place, tmp_path):
+    words = ("watch", "emulated", "--speed", 0, *FAULT, "--store", place.url, *NAME)
+    with begin(*words, folder=tmp_path) as child:
         told = []
         while not told or "ALARM" not in told[-1]:
             told.append(child.stdout.readline())
             assert told[-1]
-        os.kill(child.pid, signal.SIGKILL)
+        child.kill()
     lines = [line.strip().partition(" s  ")[2] for line in told if " s  " in line]
     stored = texts(store.history("arm_7"), "watch")
     assert stored[1 : 1 + len(lines)] == lines
@@ -159,20 +155,19 @@ def test_what_a_killed_watch_has_told_is_stored(store, place, tmp_path):
     assert store.check().problems == ()
 
 
-def test_a_killed_act_keeps_what_it_has_done(file, tmp_path):
+def test_a_killed_act_keeps_what_it_has_done(begin, file, tmp_path):
     store = ft.open_store(file, create=True)
     targets = ("-0.064,0.160,0.168", "0.146,-0.122,0.212", "0.022,-0.181,0.208") * 40
     (tmp_path / "task.csv").write_text("\n".join(("x,y,z", *targets)))
-    command = [sys.executable, "-m", "failuretwin", "act", "task.csv", "--store", file, *NAME]
-    command += ["--fault", "motor_3:stuck=-0.4"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as child:
+    words = ("act", "task.csv", "--store", file, *NAME, "--fault", "motor_3:stuck=-0.4")
+    with begin(*words, folder=tmp_path) as child:
         told = ""
         while "target (" not in told:
             assert child.poll() is None
             time.sleep(0.05)
             with suppress(InputError):  # the robot is not known yet
                 told = "\n".join(texts(store.history("arm_7"), "act"))
-        os.kill(child.pid, signal.SIGKILL)
+        child.kill()
     assert [one.motor for one in store.history("arm_7").episodes] == ["motor_3"]
     assert "ALARM: motor 3 stuck" in told
     assert store.check().problems == ()
@@ -334,22 +329,15 @@ def test_a_watch_goes_on_from_what_earlier_ones_have_learned(run, place, store):
     assert int(now) > int(known) > 0
 
 
-def test_a_killed_watch_keeps_what_it_has_learned(run, file, tmp_path):
+def test_a_killed_watch_keeps_what_it_has_learned(run, begin, file, tmp_path):
     ft.open_store(file, create=True)
     words = ("watch", "emulated", "--speed", "0", "--calibration", "generic", "--track")
     words += ("--store", str(file), *NAME)
-    with (
-        closing(sqlite3.connect(file)) as rows,
-        subprocess.Popen(
-            [sys.executable, "-m", "failuretwin", *words],
-            stdout=subprocess.DEVNULL,
-            cwd=tmp_path,
-        ) as child,
-    ):
+    with closing(sqlite3.connect(file)) as rows, begin(*words, folder=tmp_path) as child:
         while not rows.execute("SELECT 1 FROM beliefs").fetchall():
             assert child.poll() is None
             time.sleep(0.05)
-        os.kill(child.pid, signal.SIGKILL)
+        child.kill()
         child.wait()
         ((known,),) = rows.execute("SELECT sum(json_array_length(rows)) FROM beliefs")
         ((learned,),) = rows.execute("SELECT max(runs) FROM beliefs")
