@@ -148,8 +148,8 @@ def test_markup_in_names_is_only_text(run, store, tmp_path):
 def test_the_calibration_of_the_store_is_used_where_none_is_named(
     run, failuretwin, store, rows, simulated, tmp_path
 ):
-    healthy = load_run_set(simulated).isel(run=[0] * 3)
-    names = [f"run_{k}" for k in range(3)]
+    healthy = load_run_set(simulated).isel(run=[0] * 2)
+    names = [f"run_{k}" for k in range(2)]
     save_run_set(healthy.assign_coords(run=names).drop_vars("fault"), tmp_path / "healthy.nc")
     words = ("--robot-name", "arm_7", *store)
     told = run("calibrate", "healthy.nc", "--out", "mine.toml", *words)

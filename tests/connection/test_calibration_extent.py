@@ -22,10 +22,10 @@ LABELS = ["fault", "fault_detail", "onset", "magnitude", "position"]
 
 
 def healthy_runs(robot, like, movements=None):
-    """Four runs of a healthy robot; movements that are given follow each other without a rest."""
+    """Three runs of a healthy robot; movements that are given follow each other without a rest."""
     own = replace(like, lost_commands=())
     own = own if movements is None else replace(own, schedule=Schedule(period_s=(1.2, 1.2)))
-    plan = Plan(robot, [HEALTHY], 4, seed=5, imperfections=own, movements=movements)
+    plan = Plan(robot, [HEALTHY], 3, seed=5, imperfections=own, movements=movements)
     return simulate(plan).drop_vars(LABELS, errors="ignore")
 
 
@@ -38,11 +38,11 @@ def restless(armpi, measured_armpi):
 def test_a_calibration_of_an_arm_that_never_rests_counts_moments(armpi, restless):
     found = restless
     head = str(calibration_parts(found, armpi)[0])
-    assert f"{found.movements} moments on the way of 4 runs" in head
+    assert f"{found.movements} moments on the way of 3 runs" in head
     assert "settled" not in head
     assert (
         replace(found, movements=3, moments=1).extent
-        == "2 settled movements and 1 moment on the way of 4 runs"
+        == "2 settled movements and 1 moment on the way of 3 runs"
     )
 
 
