@@ -115,7 +115,7 @@ class FollowedWay:
         off = np.zeros((moments.runs, len(first), moments.count, len(sizes)))
         magnitude = np.tile(sizes, len(first))
         for run, way in enumerate(moments.way[:, :, motor]):
-            grid = np.linspace(0.0, max(time[run, -1], 1.0), way.size)
+            grid = np.linspace(0.0, max(time[run, -1], LEAST_S), way.size)
             reference = np.interp(grid, told_s[run].ravel(), way.ravel())
             courses = [Course(STEP, s) for s in begin[run, first].repeat(len(sizes)).tolist()]
             faults = FaultGroup(magnitude, courses)
