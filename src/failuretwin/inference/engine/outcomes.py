@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.core.compiled import compiled
+from failuretwin.core.compiled import compiled, laid_out
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.engine.moments import Moments
 from failuretwin.inference.engine.theta import Shown
@@ -30,9 +30,9 @@ def seen_variance(jacobian: FloatArray, variance: FloatArray) -> FloatArray:
     """
     channels, motors = jacobian.shape[-2:]
     lead = jacobian.shape[:-2]
-    flat = np.ascontiguousarray(np.broadcast_to(variance, (*lead, motors))).reshape(-1, motors)
+    flat = laid_out(np.broadcast_to(variance, (*lead, motors))).reshape(-1, motors)
     found = np.empty((*lead, channels, channels))
-    J = np.ascontiguousarray(jacobian).reshape(-1, channels, motors)
+    J = laid_out(jacobian).reshape(-1, channels, motors)
     _write_seen_variance(J, flat, found.reshape(-1, channels, channels))
     return found
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from failuretwin.core.compiled import compiled
+from failuretwin.core.compiled import compiled, laid_out
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.engine.filter import Places, RowsPosterior, Tables, filter_picks, refine
 from failuretwin.inference.engine.outcomes import Outcomes
@@ -118,7 +118,7 @@ def prepared(scene: Scene, rows: Rows, components: Components) -> Prepared:
 
 
 def _contiguous(tables: Sequence[FloatArray]) -> Tables:
-    return Tables(*(np.ascontiguousarray(table) for table in tables))
+    return Tables(*map(laid_out, tables))
 
 
 def _of_f(
@@ -284,7 +284,7 @@ class Part:
             np.stack(factors, axis=1) ** 2,
             self.scene.moments.usable[picks.run],
             _kept(self.scene, self.rows, picks),
-            self.rows.lever[picks.run, picks.row],
+            laid_out(self.rows.lever[picks.run, picks.row]),
             self.rows.variance[picks.run, picks.row],
         )
 

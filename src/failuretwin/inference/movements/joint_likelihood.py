@@ -23,7 +23,7 @@ from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.compiled import compiled
+from failuretwin.core.compiled import compiled, laid_out
 from failuretwin.core.numerics import log_fall
 from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray
 from failuretwin.inference.observation.command_loss import CommandOutcomes
@@ -124,7 +124,7 @@ class JointLikelihood(ArrayStruct):
         precision, log_weight = self._with_scatter(held)
         *lead, outcomes = log_weight.shape
         nodes, own = angle.shape[-2:]
-        of_items = np.ascontiguousarray(np.broadcast_to(angle, (*lead, nodes, own)))
+        of_items = laid_out(np.broadcast_to(angle, (*lead, nodes, own)))
         found = np.empty((*lead, nodes))
         _write_log_density(
             of_items.reshape(-1, nodes, own),
