@@ -65,7 +65,7 @@ def test_a_trained_network_is_calibrated_on_the_other_engine(network, armpi):
     assert loaded.weights_.bayes > loaded.weights_.network  # it has seen four batches
     assert f"temperature {loaded.temperature_:.2f}" in told
     assert loaded.temperature_ != 1.0
-    assert loaded.encoder.expected.name == "armpi_fpv"
+    assert loaded.encoder.imperfections.name == "armpi_fpv"
     assert next(iter(loaded.classes_)) == "healthy"
     assert path.with_suffix(".onnx").read_text().split() == list(loaded.classes_)
 

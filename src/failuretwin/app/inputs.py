@@ -248,4 +248,4 @@ def expected_name(diagnoser: Diagnoser) -> str:
     encoder = getattr(diagnoser, "encoder", None)
     if encoder is None:
         return GENERIC_NAME
-    return encoder.expected.name if encoder.expected else "none"
+    return str(encoder.imperfections.name)

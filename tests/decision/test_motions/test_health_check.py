@@ -18,7 +18,6 @@ from failuretwin.decision.test_motions.health_check import (
     CheckResult,
     checking,
     faults_at_rest,
-    judged,
     motor_offsets,
 )
 from failuretwin.decision.test_motions.motions import Motions, read_motions, write_motions
@@ -26,12 +25,19 @@ from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.injection import ScheduledFault
 from failuretwin.failure_behavior.modes import SteadyStateError
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.engine.registration import run_posterior, sensor_in_doubt
 from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
 COUNT_RAD = np.deg2rad(0.24)
+
+
+def judged(likelihood, hypotheses, priors):
+    """Return the posterior of runs, with what is doubted of the arm integrated out."""
+    in_doubt = sensor_in_doubt(likelihood, hypotheses, priors)
+    return run_posterior(likelihood, hypotheses, priors, in_doubt)
 
 
 def seen_of(model, designed, off=0.0, play=0.0, noise=None, held=None):
