@@ -116,7 +116,8 @@ def rows_of(scene: Scene, hypothesis: Hypothesis) -> Rows:
         return held_rows(scene, motor)
     if mode.signature is Signature.REDRAWN_OFFSET:
         return redrawn_rows(scene, motor, mode)
-    if mode.signature is Signature.TRANSIENT or (mode.hysteresis and scene.layout.moving):
+    winds = mode.signature is Signature.OFFSET and mode.hysteresis and scene.layout.moving
+    if winds or mode.signature is Signature.TRANSIENT:
         return way_rows(scene, motor, mode)
     return offset_rows(scene, motor, mode)
 
