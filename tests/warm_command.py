@@ -107,7 +107,7 @@ def _call_of(argv, folder, environment=None):
 
 
 def _reader(pipe):
-    return os.fdopen(pipe, encoding="utf-8")
+    return Path(pipe).open(encoding="utf-8")
 
 
 class BegunCommand:
