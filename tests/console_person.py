@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -10,8 +9,8 @@ from pathlib import Path
 from selenium.common.exceptions import WebDriverException
 from selenium.webdriver.common.keys import Keys
 
-PICTURES = os.environ.get("FAILURETWIN_PICTURES")
-"""Folder for the pictures of README and docs; empty: none are taken."""
+from console_server import PICTURES
+
 LONGEST_S = 500.0
 """Longest wait [s]: ends what hangs, not what is slow."""
 LOOK_S = 0.25

@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import subprocess
-import sys
 
 import pytest
 
+from executed import command_line
 from failuretwin.app.console.users import add_user
 from fleet_servers import free_port, listens
 from waiting import wait_for
@@ -20,11 +19,14 @@ FLAGS = (
     *("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1300,1000"),
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"),
 )
+PICTURES = os.environ.get("FAILURETWIN_PICTURES")
+"""Folder for the pictures of README and docs; empty: none are taken."""
 PASSWORD = "correct horse"
 USERS = {"ada": "move", "eve": "see"}
 
 
-DEMO = ("--demo", "--demo-robots", "0", "--speed", "1")
+DEMO = ("--demo", "--demo-robots", "0", "--speed", "0.4")
+"""Arms that move slowly cost little while people look at other pages."""
 
 
 class ConsoleServer:
@@ -50,13 +52,12 @@ class ConsoleServer:
 
     def start(self):
         options = [*self._options, "--port", str(self.port)]
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "failuretwin", "console", *options],
-            cwd=self._folder,
-            env={
-                **{k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"},
-                **self._environment,
-            },
+        ours = {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"}
+        self.process = command_line().begin(
+            *("console", *options),
+            folder=self._folder,
+            environment=ours | self._environment,
+            out=self._folder / "console.log",
         )
         try:
             wait_for(self._listens)
@@ -90,5 +91,7 @@ def open_browser():
     options.binary_location = chromium
     for flag in FLAGS:
         options.add_argument(flag)
+    if not PICTURES:  # a quarter of the pixels, all drawn by the processor
+        options.add_argument("--force-device-scale-factor=0.5")
     options.set_capability("goog:loggingPrefs", {"performance": "ALL", "browser": "ALL"})
     return webdriver.Chrome(options, webdriver.ChromeService(driver))

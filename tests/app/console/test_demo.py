@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
 import socket
-import subprocess
-import sys
 import tempfile
 
 import psutil
@@ -16,8 +13,8 @@ pytest.importorskip("nicegui")
 pytest.importorskip("selenium", reason="selenium is not installed")
 
 import failuretwin as ft
-from console_person import PICTURES, Person
-from console_server import ConsoleServer
+from console_person import Person
+from console_server import PICTURES, ConsoleServer
 from waiting import wait_for
 
 TRACKED, SICK, LIVE = "hall_2-arm_9", "hall_2-arm_7", "hall_1-arm_2"
@@ -128,13 +125,10 @@ def test_a_demo_that_is_killed_leaves_nothing_behind(tmp_path):
     assert list(folders.glob("failuretwin-console-*")) == []
 
 
-def test_a_port_that_is_in_use_is_told_instead_of_the_address():
+def test_a_port_that_is_in_use_is_told_instead_of_the_address(failuretwin):
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = str(taken.getsockname()[1])
-        command = [sys.executable, "-m", "failuretwin", "console", "--demo", "--port", port]
-        told = subprocess.run(
-            command, capture_output=True, text=True, cwd=tempfile.gettempdir(), env=os.environ
-        )
+        port = taken.getsockname()[1]
+        told = failuretwin("console", "--demo", "--port", port, folder=tempfile.gettempdir())
     assert told.returncode == 2
     assert "http" not in told.stdout
     assert f"port {port} (Address already in use). Choose another --port" in told.stderr

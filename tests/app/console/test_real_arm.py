@@ -5,8 +5,7 @@ The arm is an emulated one behind a real roscore.
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import os
 import time
 
 import numpy as np
@@ -16,6 +15,7 @@ pytest.importorskip("selenium", reason="selenium is not installed")
 pytest.importorskip("mujoco")
 from console_person import Person
 from console_server import PASSWORD, ConsoleServer
+from executed import command_line
 from failuretwin.connection.links.base import CommandSent, Reading
 from failuretwin.connection.links.ros1 import Ros1Transport
 from failuretwin.connection.links.ros_link import RosSource
@@ -55,8 +55,7 @@ class Listener:
 
 @pytest.fixture(scope="module")
 def arm(armpi, roscore):
-    command = [sys.executable, "-m", "failuretwin", "emulate", "--to", "ros1", "--obey"]
-    process = subprocess.Popen(command)
+    process = command_line().begin("emulate", "--to", "ros1", "--obey", out=os.devnull)
     with Ros1Transport() as transport:
         listener = Listener(RosSource(armpi, RosTopics(), transport))
         wait_for(lambda: listener.hear() == 0 and listener.angle is not None)

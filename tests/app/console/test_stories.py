@@ -1,5 +1,6 @@
 """What people do with the console, by what they see and click, in a real browser.
 
+Also time zones, units, print, phones and colours, as the browser shows them, and all by keys alone.
 The stories are told in their order, on one server and in one browser.
 """
 
@@ -16,7 +17,10 @@ import failuretwin as ft
 from console_server import PASSWORD
 
 pytest.importorskip("selenium", reason="selenium is not installed")
-from console_person import Person
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+
+from console_person import LONGEST_S, Person
 
 TOOL_COLUMNS = """
 [tool]
@@ -25,6 +29,18 @@ unit = "m"
 """
 SICK, LIVE, SILENT, DOUBTED = "hall_2-arm_7", "hall_1-arm_2", "hall_1-arm_3", "hall_2-arm_8"
 TUESDAY = "//tr[td[normalize-space()='tuesday']]"
+PHONE = {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True}
+CONTRAST = {"runOnly": {"type": "rule", "values": ["color-contrast"]}}
+WIDTH = "return document.documentElement.scrollWidth"
+MOST_STOPS = 120
+"""Stops of a page that are gone through at most."""
+FOCUSED = """const one = document.activeElement;
+if (one === document.body) return ['', true];
+const seen = (part) => part && getComputedStyle(part).outlineStyle !== 'none' &&
+  parseFloat(getComputedStyle(part).outlineWidth) >= 2;
+const label = one.labels?.[0]?.textContent || '';
+return [one.getAttribute('aria-label') || label || one.textContent || one.name || '',
+  seen(one) || seen(one.closest('.q-field'))];"""
 
 
 @pytest.fixture(scope="module")
@@ -204,6 +220,221 @@ def test_the_pages_have_no_serious_finding_of_axe(person):
             if one["impact"] in ("serious", "critical"):
                 found[page, one["id"]] = [node["html"][:300] for node in one["nodes"][:3]]
     assert found == {}, found
+
+
+# Time zone, units, print, phones and colours.
+
+
+def tell(person, command, **values):
+    return person.browser.execute_cdp_cmd(f"Emulation.{command}", values)
+
+
+def test_times_are_those_of_the_reader(person):
+    hours = {}
+    for zone in ("Asia/Tokyo", "America/New_York"):
+        tell(person, "setTimezoneOverride", timezoneId=zone)
+        person.browser.delete_cookie("zone")
+        person.go(f"/robot?name={SICK}")
+        person.waits(lambda zone=zone: person.browser.get_cookie("zone")["value"] == zone)
+        person.sees("Runs")
+        hours[zone] = person.find(TUESDAY + "/td[1]").text.split()[1]
+        person.go(f"/history?name={SICK}")
+        person.sees("Timeline", hours[zone])
+        person.go("/")
+        person.sees(SICK)
+        assert f"{hours[zone]}:00" in person.find(f"//a[strong[text()='{SICK}']]").text
+    # Logs of the demo are of midnight in Greenwich.
+    assert hours["Asia/Tokyo"] == "09:00"
+    assert hours["America/New_York"] in ("19:00", "20:00")
+    tell(person, "setTimezoneOverride", timezoneId="")
+
+
+def test_angles_are_in_the_unit_of_the_reader(person):
+    said = {}
+    for unit in ("rad", "counts", "deg"):
+        person.browser.add_cookie({"name": "unit", "value": unit})
+        person.go(f"/robot?name={SICK}")
+        person.sees("Held at [" + unit)
+        said[unit] = person.find(TUESDAY).text
+    assert "stuck at 26 deg" in said["deg"]
+    assert "stuck at 0.454 rad" in said["rad"]  # 26 pi / 180
+    assert "stuck at 392 counts" in said["counts"]  # (120 - 26) / 0.24
+    person.browser.add_cookie({"name": "unit", "value": "counts"})
+    person.go("/import")
+    person.find("//input[@type='file']")
+    person.go(f"/robot?name={LIVE}")
+    person.waits(lambda: "counts" in person.find("//tr[td[normalize-space()='motor 1']]").text)
+    person.browser.delete_cookie("unit")
+
+
+def test_the_page_for_technicians_prints(person):
+    person.go(f"/robot?name={SICK}")
+    person.press(TUESDAY + "//a[normalize-space()='Page for technicians']")
+    person.sees("motor 3", "Next step")
+    button = person.find("//button[normalize-space()='Print, or save as PDF']")
+    assert button.is_displayed()
+    tell(person, "setEmulatedMedia", media="print")
+    assert not button.is_displayed()
+    tell(person, "setEmulatedMedia", media="")
+    person.browser.execute_script("window.print = () => { document.title = 'printed'; }")
+    button.click()
+    assert person.browser.title == "printed"
+    pdf = person.browser.execute_cdp_cmd("Page.printToPDF", {})["data"]
+    assert pdf.startswith("JVBER")  # %PDF in base 64
+
+
+def test_the_wall_fits_a_phone(person):
+    tell(person, "setDeviceMetricsOverride", **PHONE)
+    person.go("/")
+    person.sees(SICK)
+    assert person.browser.execute_script(WIDTH) <= PHONE["width"]
+    tell(person, "clearDeviceMetricsOverride")
+
+
+def test_dark_colours_have_contrast(person):
+    """Light ones are judged with all else: test_the_pages_have_no_serious_finding_of_axe."""
+    axe = pytest.importorskip("axe_selenium_python", reason="axe-selenium-python is missing")
+    person.browser.add_cookie({"name": "theme", "value": "dark"})
+    found = []
+    named = f"name={SICK}"
+    person.go(f"/robot?{named}")
+    replay = person.find(TUESDAY + "//a[normalize-space()='Replay']").get_attribute("href")
+    replay = replay.removeprefix(person.url)
+    pages = ("/", f"/robot?{named}", f"/history?{named}", replay, "/check")
+    for page in pages:
+        person.go(page)
+        person.find("//main//h1")
+        time.sleep(1.0)
+        checker = axe.Axe(person.browser)
+        checker.inject()
+        wrong = checker.run(options=CONTRAST)["violations"]
+        found += [(page, node["html"][:200]) for one in wrong for node in one["nodes"]]
+    person.browser.delete_cookie("theme")
+    assert found == []
+
+
+# By keys alone: no pointer, and the focus is seen at every stop.
+
+
+class Keyboard(Person):
+    """Somebody who has no pointer."""
+
+    def keys(self, *keys):
+        ActionChains(self.browser).send_keys(*keys).perform()
+
+    @property
+    def focus(self):
+        """Words of what has the focus, which must be seen to have it."""
+        words, seen = self.browser.execute_script(FOCUSED)
+        assert seen, f"the focus on {words!r} is not seen"
+        return words.strip()
+
+    def tab_to(self, words):
+        """Go on by Tab until something with some words has the focus."""
+        stops = []
+        deadline = time.monotonic() + LONGEST_S
+        while time.monotonic() < deadline and len(stops) < MOST_STOPS:
+            self.keys(Keys.TAB)
+            stops.append(self.focus)
+            if words in stops[-1]:
+                return
+        raise AssertionError(f"{words!r} is not among {stops}")
+
+    def open(self, words):
+        self.tab_to(words)
+        self.keys(Keys.ENTER)
+
+
+@pytest.fixture(scope="module")
+def keyboard(browser, server):
+    browser.delete_all_cookies()
+    found = Keyboard(browser, server.url)
+    found.go("/login")
+    return found
+
+
+def test_somebody_signs_in_finds_the_sick_robot_and_confirms(keyboard):
+    keyboard.waits(lambda: keyboard.focus == "Name")
+    keyboard.keys("ada", Keys.TAB, PASSWORD, Keys.ENTER)
+    keyboard.sees(SICK)
+    keyboard.tab_to("Search")
+    keyboard.keys("stuck")
+    keyboard.sees("arm_7")
+    keyboard.tab_to("State")
+    keyboard.keys("alarm")
+    keyboard.open(SICK)
+    keyboard.sees("What to do now", "motor 3 stuck")
+    keyboard.open("History")
+    keyboard.sees("Fault episodes")
+    keyboard.tab_to("Note")
+    keyboard.keys("by keys")
+    keyboard.open("Confirm: episode 1")
+    keyboard.sees("confirmed, by keys, ada")
+    keyboard.waits(lambda: keyboard.focus == "Confirm: episode 1")
+    keyboard.open("Undo: episode 1")
+    keyboard.sees("finding 'confirmed' withdrawn")
+
+
+def test_the_moment_is_replayed(keyboard):
+    keyboard.open(SICK)
+    keyboard.sees("Runs")
+    tuesday = keyboard.find("//tr[td[normalize-space()='tuesday']]//a")
+    keyboard.open(tuesday.get_attribute("aria-label"))
+    keyboard.sees("possible causes")
+    keyboard.find("//input[@type='range']")
+    before = clock(keyboard)
+    keyboard.tab_to("Time in the run")
+    keyboard.keys(*[Keys.ARROW_RIGHT] * 50)
+    keyboard.waits(lambda: clock(keyboard) == pytest.approx(before + 1.0, abs=0.05))
+    keyboard.open("movement 4:")
+    keyboard.waits(lambda: clock(keyboard) > 3.0)
+    before = clock(keyboard)
+    keyboard.keys(Keys.SHIFT + Keys.TAB)
+    keyboard.open("Replay")
+    keyboard.waits(lambda: clock(keyboard) > before)
+    keyboard.open("Above")
+
+
+def clock(keyboard):
+    return float(keyboard.find("//p[@role='status']").text.split()[0])
+
+
+def test_a_live_robot_is_followed_while_its_page_is_drawn_anew(keyboard):
+    keyboard.open("Robots")
+    keyboard.sees(LIVE)
+    keyboard.open(LIVE)
+    keyboard.sees("motor 3 stuck", "nats for motor 3")
+    keyboard.open("movement ")
+    keyboard.sees("Replay: ")
+
+
+def test_a_check_is_begun_and_stopped(keyboard):
+    keyboard.open("Check")
+    keyboard.sees("Seconds")
+    keyboard.tab_to("Seconds")
+    keyboard.keys(Keys.CONTROL + "a", "30")
+    keyboard.open("Start the check")
+    keyboard.sees("has begun")
+    keyboard.open("STOP")
+    keyboard.sees("stopped by ada; ")
+
+
+def test_colours_and_units_are_chosen(keyboard):
+    keyboard.tab_to("Angles in")
+    keyboard.keys(Keys.ARROW_DOWN)
+    keyboard.waits(
+        lambda: keyboard.browser.get_cookie("unit") and keyboard.focus.startswith("Angles in")
+    )
+    assert keyboard.browser.get_cookie("unit")["value"] == "rad"
+
+
+def test_a_log_can_be_chosen(keyboard):
+    keyboard.open("Import a log")
+    keyboard.sees("Drop a log here")
+    keyboard.tab_to("Log file")
+
+
+# The end: nothing went elsewhere; the server is killed and comes back.
 
 
 def test_no_request_leaves_the_machine(person, server):
