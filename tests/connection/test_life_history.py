@@ -134,6 +134,15 @@ def test_damage_is_named(armpi, evidence, calibration, spoil, told):
         open_history(calibration, life(armpi), cold=False)
 
 
+def test_a_state_of_another_version_is_named(armpi, evidence, calibration):
+    go_on(armpi, calibration, evidence, slice(0, 5))
+    state = history_path(calibration).with_suffix(".npz")
+    with np.load(state) as stored:
+        np.savez(state, **{name: stored[name] for name in stored.files if name != "seen/begin"})
+    with pytest.raises(InputError, match="'seen/begin'; another version of failuretwin kept it"):
+        open_history(calibration, life(armpi), cold=False)
+
+
 @pytest.mark.parametrize("what", ["settling", "doubt", "limits"])
 def test_a_history_of_another_calibration_is_refused(armpi, evidence, calibration, what):
     go_on(armpi, calibration, evidence, slice(0, 2))

@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -353,7 +353,21 @@ def open_history(calibration: Path, start: LifeFilter, cold: bool) -> History:
         lines = content[:size].decode().splitlines()
         rows = [_object(line, f"{path}: line {n}") for n, line in enumerate(lines, start=1)]
         _check_head(rows[0], path, start)
-        return History(start.resumed(arrays), cold, path, size, tuple(r["key"] for r in rows[1:]))
+        life = _resumed(start, arrays, path, state)
+        return History(life, cold, path, size, tuple(r["key"] for r in rows[1:]))
+
+
+def _resumed(
+    start: LifeFilter, arrays: Mapping[str, FloatArray], path: Path, state: Path
+) -> LifeFilter:
+    """Return what was believed when `state` was kept; a part that is missing is one that is new."""
+    try:
+        return start.resumed(arrays)
+    except KeyError as error:
+        raise InputError(
+            f"{state}: has no {error.args[0]!r}; another version of failuretwin kept it. Move it "
+            f"and {path} away to begin a new history."
+        ) from error
 
 
 def read_rows(path: Path, robot: str) -> list[dict[str, Any]]:
