@@ -27,6 +27,9 @@ from failuretwin.digital_model.profile import Motor, Profile
 from failuretwin.digital_model.servo import ServoUnits
 from failuretwin.digital_model.urdf.file import read_urdf
 
+HELD_BEYOND = 0.1
+"""Share of its travel by which a motor may be held beyond its ends: limits are not stops."""
+
 
 @dataclass(frozen=True)
 class Robot:
@@ -122,6 +125,15 @@ class Robot:
             return low, high
         middle = 0.5 * sum(motor.movement_range)
         return max(low, middle - math.pi), min(high, middle + math.pi)
+
+    def held_beyond(self, motor: int) -> float:
+        """Return by how much a motor may be held beyond its travel [rad or m].
+
+        At most so far that no two held angles are the same: beyond a full turn all come again.
+        """
+        length = float(np.ptp(self.travel[motor]))
+        margin = HELD_BEYOND * length
+        return margin if self.slides[motor] else min(margin, max(0.0, math.pi - 0.5 * length))
 
     @cached_property
     def slides(self) -> BoolArray:

@@ -26,8 +26,6 @@ TIED = 2.0
 """Deviation of a held angle from where the motor had settled, in its scatter."""
 MARGIN = 4.0
 """What a motor that stops on its ramp may be beyond its ends, in its scatter."""
-BEYOND = 0.1
-"""Share of its travel by which a motor may be held beyond its ends."""
 POINTS = np.linspace(0.05, 0.95, 10)
 """Where in a stretch of time onsets are sampled, as shares of its length."""
 NORMAL_QUANTILES = ndtri(POINTS)
@@ -122,10 +120,7 @@ def _held_angle(count: int) -> Angle:
 def held_range(scene: Scene, motor: int) -> tuple[FloatArray, FloatArray]:
     """Return the lowest and the highest angle at which a motor may be held, (run,) [rad] each."""
     robot, moments = scene.model.twin.robot, scene.moments
-    low, high = robot.travel[motor]
-    margin = BEYOND * (high - low)
-    if not robot.slides[motor]:  # beyond a full turn all angles come again
-        margin = min(margin, max(0.0, np.pi - 0.5 * (high - low)))
+    (low, high), margin = robot.travel[motor], robot.held_beyond(motor)
     told = np.concatenate([moments.origin[:, :1, motor], moments.target[..., motor]], axis=1)
     lowest, highest = told.min(axis=1), told.max(axis=1)
     return np.minimum(low, lowest) - margin, np.maximum(high, highest) + margin

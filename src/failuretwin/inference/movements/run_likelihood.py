@@ -15,6 +15,7 @@ import numpy as np
 
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.digital_model.robot import HELD_BEYOND
 from failuretwin.inference.movements.joint_likelihood import (
     JointLikelihood,
     MovementLikelihoods,
@@ -29,8 +30,6 @@ HELD_ANGLES = 25
 """Held angles at which the way is judged, over a range of `USUAL_TRAVEL` or less."""
 USUAL_TRAVEL = 3.4
 """Range of held angles up to which so few are enough [rad]; over a wider one they are more."""
-HELD_BEYOND = 0.1
-"""Share of its travel by which a motor may be held beyond its ends: limits are not stops."""
 
 
 @dataclass(frozen=True)
@@ -186,10 +185,8 @@ class RunLikelihood:
 
         Its travel, wider where a run's commands go beyond, and a little more.
         """
-        low, high = self.model.twin.robot.travel[motor]
-        margin, movements = HELD_BEYOND * (high - low), self.evidence.movements
-        if not self.model.twin.robot.slides[motor]:  # beyond a full turn all angles come again
-            margin = min(margin, max(0.0, np.pi - 0.5 * (high - low)))
+        robot, movements = self.model.twin.robot, self.evidence.movements
+        (low, high), margin = robot.travel[motor], robot.held_beyond(motor)
         told = np.column_stack([movements.initial[:, motor], movements.target[..., motor]])
         lowest, highest = np.nanmin(told, axis=1), np.nanmax(told, axis=1)
         return np.minimum(low, lowest) - margin, np.maximum(high, highest) + margin

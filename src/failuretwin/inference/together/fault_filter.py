@@ -36,7 +36,7 @@ from failuretwin.inference.faults.marginal import movement_log_likelihoods
 from failuretwin.inference.faults.prior_odds import shares_of_motors
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.faults.stuck import held_prior, stuck_intervals
-from failuretwin.inference.movements.run_likelihood import HELD_BEYOND, RunLikelihood
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import motor_of
 
@@ -283,10 +283,7 @@ class FaultFilter:
         robot = self.model.twin.robot
         for fault in self._of(Signature.HELD):
             motor = robot.motor_names.index(fault.motor)
-            low, high = robot.travel[motor]
-            margin = HELD_BEYOND * (high - low)
-            if not robot.slides[motor]:
-                margin = min(margin, max(0.0, np.pi - 0.5 * (high - low)))
+            (low, high), margin = robot.travel[motor], robot.held_beyond(motor)
             width = high - low + 2.0 * margin
             count = min(MOST_NODES, int(np.ceil(width / (STEP * self.model.least_visible[motor]))))
             found.append(np.linspace(low - margin, high + margin, count + 1))
