@@ -5,10 +5,11 @@ import pytest
 from dh_arms import UR5, forward, robot_in, urdf
 from scipy.spatial.transform import Rotation
 
-from failuretwin.connection.registration.arm import Poses
+from failuretwin.connection.registration.arm import Arm, Fitted, Poses, Start
 from failuretwin.connection.registration.fit import register
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.robot import _assembled
+from failuretwin.inference.set_ups.registration import Frame
 
 STRAIGHT = """<robot name="straight"><link name="base"/>
 <joint name="turn" type="revolute"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/>
@@ -49,6 +50,31 @@ def value(found, name, motor=""):
 def fitted_path(found, robot, q):
     made = _assembled(found.profile, robot.source)
     return made.chain.position(q * made.sensor_sense)
+
+
+@pytest.mark.parametrize("sliding", [None, "joint_1", "joint_3"])
+def test_slopes_are_those_of_differences(tmp_path, sliding):
+    text, sense = urdf(), np.array([1.0, -1.0, 1.0, 1.0, -1.0])
+    if sliding is not None:
+        turns = f'name="{sliding}" type="revolute"'
+        text = text.replace(turns, turns.replace("revolute", "prismatic"))
+        assert "prismatic" in text
+    arm, rng = Arm(robot_in(tmp_path, text)), np.random.default_rng(3)
+    turn, origin = frame(rng)
+    start = Start(sense, np.zeros(5), Frame(turn.as_matrix(), origin, 0.0))
+    unknowns = arm.details()
+    values, step = rng.normal(size=len(unknowns)) * unknowns.spread, 1e-5 * unknowns.spread
+    target = commands(rng, 6)
+    torque = arm.torque(target, start)
+
+    def expected(values):
+        return Fitted(arm, start, unknowns, values).expected(target, torque)
+
+    found = Fitted(arm, start, unknowns, values).slopes(target, torque)
+    for i, size in enumerate(step):
+        off = size * np.eye(len(step))[i]
+        differences = (expected(values + off) - expected(values - off)) / (2.0 * size)
+        assert found[..., i] == pytest.approx(differences, rel=1e-5, abs=1e-7), unknowns[i]
 
 
 def test_a_frame_far_off_is_found(robot):

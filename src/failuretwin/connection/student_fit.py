@@ -32,8 +32,14 @@ SIGMA_ROUNDS = 6
 SETTLED = 0.02
 """Relative change of the scatter that ends them."""
 
+STEP = 1e-4
+"""Step of differences where the slopes of residuals have no closed form."""
+LEAST_SQUARE = 1e-8
+"""Squared distance below which a row weighs as one that fits exactly."""
+
 Residual = Callable[[FloatArray], FloatArray]
-"""Residuals (row, n) by the unknowns (unknown,) in units of what was believed before."""
+"""Residuals (row, n) by the unknowns (unknown,) in units of what was believed before; or their
+slopes (row, n, unknown)."""
 
 
 @dataclass(frozen=True)
@@ -55,20 +61,25 @@ class StudentFit:
     log_likelihood: float
 
 
-def fit_student(residual: Residual, begin: FloatArray, dims: int) -> StudentFit:
-    """Return the unknowns fitted to rows, from `begin` (unknown,).
+def fit_student(
+    residual: Residual, begin: FloatArray, dims: int, slopes: Residual | None = None
+) -> StudentFit:
+    """Return the unknowns fitted to rows.
 
-    `dims` is n, the dimensions in which residuals can differ; channels may be more.
+    Args:
+        residual: Residuals of the rows.
+        begin: Unknowns to begin with, (unknown,).
+        dims: n, the dimensions in which residuals can differ; channels may be more.
+        slopes: Derivatives of the residuals; None: by differences.
     """
+    slopes = slopes or _differences(residual)
     x, sigma = begin, _sigma(residual(begin), np.inf, dims)
     for _ in range(SIGMA_ROUNDS):
-        x = _mode(residual, x, sigma, dims)
+        x = _mode(residual, slopes, x, sigma, dims)
         before, sigma = sigma, _sigma(residual(x), sigma, dims)
         if abs(sigma - before) < SETTLED * sigma:
             break
-    r, steps = residual(x), 1e-4 * np.eye(len(x))
-    slopes = [(residual(x + step) - residual(x - step)).ravel() / 2e-4 for step in steps]
-    J = np.stack(slopes, axis=1)
+    r, J = residual(x), slopes(x).reshape(-1, len(x))
     freedom = float(dims * len(r))
     size = np.linalg.svd(J / sigma, compute_uv=False) ** 2
     lost = min(float(np.sum(size / (1.0 + size))), 0.9 * freedom)  # told by rows, not by the prior
@@ -78,16 +89,43 @@ def fit_student(residual: Residual, begin: FloatArray, dims: int) -> StudentFit:
     return StudentFit(x, covariance, sigma, noise, float(density.sum()))
 
 
-def _mode(residual: Residual, x: FloatArray, sigma: float, dims: int) -> FloatArray:
-    """Return the mode: the log density of a row as a square, with the prior beside it."""
+def _differences(residual: Residual) -> Residual:
+    """Return the slopes of residuals by central differences."""
+
+    def slopes(x: FloatArray) -> FloatArray:
+        steps = STEP * np.eye(len(x))
+        each = [(residual(x + step) - residual(x - step)) / (2.0 * STEP) for step in steps]
+        return np.stack(each, axis=-1)
+
+    return slopes
+
+
+def _mode(
+    residual: Residual, slopes: Residual, x: FloatArray, sigma: float, dims: int
+) -> FloatArray:
+    """Return the mode: the log density of a row as a square, with the prior beside it.
+
+    A row r at the squared distance d stands as f r, with f^2 = (4 + n) log(1 + d / 4) / |r|^2.
+    """
+
+    def shrunk(r: FloatArray) -> tuple[FloatArray, FloatArray]:
+        square = np.maximum(np.einsum("ia,ia->i", r, r) / sigma**2, LEAST_SQUARE)
+        return square, np.sqrt((DOF + dims) * np.log1p(square / DOF) / square) / sigma
 
     def terms(x: FloatArray) -> FloatArray:
         r = residual(x)
-        square = np.maximum(np.einsum("ia,ia->i", r, r) / sigma**2, 1e-30)
-        shrunk = np.sqrt((DOF + dims) * np.log1p(square / DOF) / square) / sigma
-        return np.concatenate([(r * shrunk[:, None]).ravel(), x])
+        return np.concatenate([(r * shrunk(r)[1][:, None]).ravel(), x])
 
-    return np.asarray(least_squares(terms, x, method="lm", max_nfev=40 * (len(x) + 1)).x)
+    def jacobian(x: FloatArray) -> FloatArray:
+        r, J = residual(x), slopes(x)
+        square, factor = shrunk(r)
+        change = 1.0 / ((DOF + square) * np.log1p(square / DOF)) - 1.0 / square  # of log f^2
+        along = np.einsum("ia,iau->iu", r, J) * (change / sigma**2)[:, None]
+        whole = factor[:, None, None] * (J + r[..., None] * along[:, None])
+        return np.concatenate([whole.reshape(-1, len(x)), np.eye(len(x))])
+
+    most = 40 * (len(x) + 1)
+    return np.asarray(least_squares(terms, x, jacobian, method="lm", max_nfev=most).x)
 
 
 def _sigma(r: FloatArray, sigma: float, dims: int) -> float:

@@ -34,7 +34,7 @@ from failuretwin.digital_model.geometry import (
     seen_chain,
     with_tool,
 )
-from failuretwin.digital_model.kinematics import Loads, SerialChain, rotation_to_z
+from failuretwin.digital_model.kinematics import Loads, SerialChain, cross, rotation_to_z
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import poses_in_range
 from failuretwin.digital_model.urdf.file import Triple, Urdf, read_urdf, transform
@@ -58,6 +58,8 @@ SAG_RAD = 0.03
 LEAST_LOAD_NM = 1e-6
 """Torque below which gravity does not load a motor [N m]."""
 
+LEAST_TURN_RAD = 1e-4
+"""Turn below which first order is exact."""
 ANGLES = ("roll", "pitch", "yaw")
 """What the turn of the base is told in; it is fitted about the sensor's x, y and z."""
 
@@ -326,8 +328,55 @@ class Fitted:
             target: Commanded angles, (pose, motor) [rad].
             torque: Gravity on the motors there, (pose, motor) [N m].
         """
+        return self.chain.position(self._joints(target, torque))
+
+    def _joints(self, target: FloatArray, torque: FloatArray) -> FloatArray:
+        """Return joint values beside their zeros, (pose, motor) [rad or m]."""
         sag = np.array([self.value("sag", j) for j in range(self.arm.motors)])
-        return self.chain.position(self.start.sense * target + sag * torque)
+        return self.start.sense * target + sag * torque
+
+    def slopes(self, target: FloatArray, torque: FloatArray) -> FloatArray:
+        """Return the derivative of `expected` by the unknowns, (pose, 3, unknown).
+
+        With p the tool and o, R origin and rotation of a frame, a shift of the frame along its axis
+        k moves p by R e_k, a turn by w about its axes by R J e_k x (p - o), J = J(w).
+        """
+        q = self._joints(target, torque)
+        frames, motors = self.chain.frames_by_joint(q), range(self.arm.motors)
+        point, from_base = frames[-1, 3], frames[-1, 3] - self.origin[:, None]
+        jacobian = np.moveaxis(self.chain.position_and_jacobian(q)[1], 0, -1)  # (3, joint, pose)
+        base = np.broadcast_to(np.eye(3)[..., None], (3, *point.shape))
+        turns = _left_jacobian(self._three(*(f"base {angle}" for angle in ANGLES))).T[..., None]
+        found: dict[tuple[str, int | None], FloatArray] = {
+            ("sensor scale", None): from_base / self.scale
+        }
+        for k, axis in enumerate("xyz"):
+            found["base " + axis, None] = base[k]
+            found["base " + ANGLES[k], None] = cross(turns[k], from_base, 0)
+            found["tool " + axis, None] = self.scale * frames[-1, k]
+        for j in motors:
+            found["zero", j] = jacobian[:, j]
+            found["sag", j] = jacobian[:, j] * torque[:, j]
+            moves = self._moves(j, frames[j], point)
+            for way, line in enumerate(self.arm.lines[j].T * AXIS_SPREADS):
+                found[f"axis {way + 1}", j] = np.tensordot(line, moves, 1)
+        return np.stack([found[one.name, one.motor].T for one in self.unknowns], axis=-1)
+
+    def _moves(self, j: int, frame: FloatArray, point: FloatArray) -> FloatArray:
+        """Return the derivative of the tool by the shift and tilt of an axis, (4, 3, pose).
+
+        Args:
+            j: Index of the joint.
+            frame: x, y, z axis and origin of its frame, (4, 3, pose).
+            point: Tool positions, (3, pose) [m].
+        """
+        joint, zero, tilt = self.arm.chain.joints[j], self.zero(j), self.moved(j)[2:]
+        own = 0.0 if joint.prismatic else zero
+        turned = _across(self.moved(j))[:3, :3] @ transform(NO_OFFSET, (0.0, 0.0, own))[:3, :3]
+        axes = np.tensordot(turned, frame[:3], 1)  # before shift, tilt and zero
+        arm = point - frame[3] + (zero if joint.prismatic else 0.0) * frame[2]
+        about = np.tensordot(_left_jacobian(np.array([*tilt, 0.0])).T[:2], axes, 1)
+        return np.concatenate([self.scale * axes[:2], cross(about, arm[None], 1)])
 
     def geometry(self, noise_m: float, source: str) -> Geometry:
         """Return it as a profile says it; `noise_m` is left unexplained on each axis [m]."""
@@ -363,14 +412,29 @@ def fit(
         expected = Fitted(arm, start, unknowns, x * spread).expected(poses.target, torque)
         return np.asarray(poses.point - expected)
 
+    def slopes(x: FloatArray) -> FloatArray:
+        return -Fitted(arm, start, unknowns, x * spread).slopes(poses.target, torque) * spread
+
     begin = np.zeros(len(unknowns)) if begin is None else begin
-    told = fit_student(residual, begin / spread, 3)
+    told = fit_student(residual, begin / spread, 3, slopes)
     return Posterior(arm, start, unknowns, told.value * spread, told)
 
 
 def _triple(values: FloatArray) -> Triple:
     x, y, z = values.tolist()
     return x, y, z
+
+
+def _left_jacobian(w: FloatArray) -> FloatArray:
+    """Return J (3, 3) of a turn about w [rad]: exp(w + dw) = exp(J dw) exp(w) to first order.
+
+    J = I + (1 - cos a) / a^2 [w]x + (a - sin a) / a^3 [w]x^2,    a = |w|
+    """
+    angle, x = float(np.linalg.norm(w)), cross(np.eye(3), w)
+    if angle < LEAST_TURN_RAD:
+        return np.asarray(np.eye(3) + 0.5 * x)
+    first, second = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    return np.asarray(np.eye(3) + first * x + second * x @ x)
 
 
 def _across(moved: FloatArray) -> FloatArray:
