@@ -107,7 +107,6 @@ def find_mutants(file: str, source: bytes) -> list[list[Mutant]]:
         source: Its text.
     """
     tree = ast.parse(source)
-    as_it_is = ast.dump(tree)
     starts = [0]
     for line in source.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
@@ -115,22 +114,32 @@ def find_mutants(file: str, source: bytes) -> list[list[Mutant]]:
     def place(line: int | None, column: int | None) -> int:
         return starts[(line or 0) - 1] + (column or 0)
 
-    def differs(mutant: Mutant) -> bool:
-        try:
-            return ast.dump(ast.parse(mutant.applied_to(source))) != as_it_is
-        except SyntaxError:
-            return False
-
     places = []
-    for node in _formulas(tree):
-        begin = place(node.lineno, node.col_offset)
-        end = place(node.end_lineno, node.end_col_offset)
-        found = [
-            Mutant(file, node.lineno, kind, begin, end, _text(instead))
-            for kind, instead in CHANGES.get(type(node), _none)(node)
-        ]
-        places.append([mutant for mutant in found if differs(mutant)])
+    for part in (part for part in tree.body if not _is_text(part)):
+        first = min(node.lineno for node in (part, *getattr(part, "decorator_list", ())))
+        begins, ends = place(first, 0), place(part.end_lineno, part.end_col_offset)
+        own = source[begins:ends]
+        as_it_is = ast.dump(ast.parse(own))
+        for node in _formulas(part):
+            begin = place(node.lineno, node.col_offset)
+            end = place(node.end_lineno, node.end_col_offset)
+            texts = [(k, _text(new)) for k, new in CHANGES.get(type(node), _none)(node)]
+            places.append(
+                [
+                    Mutant(file, node.lineno, kind, begin, end, text)
+                    for kind, text in texts
+                    if _differs(own, begin - begins, end - begins, text, as_it_is)
+                ]
+            )
     return [found for found in places if found]
+
+
+def _differs(source: bytes, begin: int, end: int, text: str, as_it_is: str) -> bool:
+    """Return whether another text in a place is Python that means something else."""
+    try:
+        return ast.dump(ast.parse(source[:begin] + text.encode() + source[end:])) != as_it_is
+    except SyntaxError:
+        return False
 
 
 def _text(node: ast.AST) -> str:
