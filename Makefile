@@ -11,9 +11,10 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: .venv/demo
 	$(BIN)/python examples/demo.py
 
+# Three processes for two cores: some tests wait for servers and browsers.
 test: .venv/ready lint
 	@$(BIN)/python -c "import failuretwin as ft; ft.diagnose(ft.sample_log())"  # compiles the engine once
-	$(BIN)/pytest -m "not slow" --numprocesses 2 --dist loadfile
+	$(BIN)/pytest -m "not slow" --numprocesses 3 --dist loadfile
 
 # A server, 100 emulated robots and two workers on this computer, until Ctrl-C.
 fleet: .venv/fleet
