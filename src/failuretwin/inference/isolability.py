@@ -8,8 +8,10 @@ Section: docs/isolability.md#method
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -113,8 +115,8 @@ class MonteCarloFaults:
 
 FOUND_NATS = 5.0
 """A fault is found if it is expected to be ahead by this: odds of 150."""
-SIZES = 5
-"""Sizes tried at first, and again between the two that the smallest one lies between."""
+CLOSE = 1.3
+"""Ratio of two sizes between which the smallest is interpolated."""
 BELOW = 0.25
 """Smallest size tried, as a share of the smallest that is considered."""
 LEAST = 0.001
@@ -125,6 +127,8 @@ def minimum_detectable_sizes(
     trials: MonteCarloFaults, hypothesis: Hypothesis, considered: tuple[float, float]
 ) -> tuple[float | None, float | None]:
     """Return the smallest sizes at which a fault is told from healthy, and from everything else.
+
+    A larger fault shows better: they are found by bisection.
 
     Args:
         trials: The motions; the first of the judge's hypotheses is healthy.
@@ -137,21 +141,38 @@ def minimum_detectable_sizes(
     own = trials.judge.hypotheses.index(hypothesis)
     further = needed_nats(trials.judge.priors.healthy_odds) - FOUND_NATS
 
-    def ahead(sizes: FloatArray) -> FloatArray:
-        nats = trials.log_bayes_factor([(hypothesis, float(size)) for size in sizes])
-        nats[:, own] = np.inf
-        nats[:, 0] -= further
-        return np.stack([nats[:, 0], nats.min(axis=1)])
+    @cache
+    def ahead(size: float) -> tuple[float, float]:
+        (nats,) = trials.log_bayes_factor([(hypothesis, size)])
+        nats[own] = np.inf
+        nats[0] -= further
+        return float(nats[0]), float(nats.min())
 
     low, high = considered
-    sizes = np.geomspace(max(BELOW * low, LEAST * high), high, SIZES)
-    nats = ahead(sizes)
-    between = np.unique(np.concatenate([_bracket(sizes, row) for row in nats]))
-    if len(between):
-        sizes, nats = np.append(sizes, between), np.append(nats, ahead(between), axis=1)
-    order = np.argsort(sizes)
-    found = [_crossing(sizes[order], row[order]) for row in nats]
-    return found[0], found[1]
+    ends = max(BELOW * low, LEAST * high), high
+    return (
+        _smallest(*ends, lambda size: ahead(size)[0]),
+        _smallest(*ends, lambda size: ahead(size)[1]),
+    )
+
+
+def _smallest(low: float, high: float, ahead: Callable[[float], float]) -> float | None:
+    """Return the size from which on a fault is found; None if the largest is not.
+
+    Args:
+        low: The smallest.
+        high: The largest.
+        ahead: By how much a fault of a size is ahead [nats].
+    """
+    if ahead(high) < FOUND_NATS:
+        return None
+    while high > CLOSE * low:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if ahead(middle) < FOUND_NATS else (low, middle)
+    missed, found = ahead(low), ahead(high)
+    if missed >= FOUND_NATS:  # the smallest that is tried
+        return low
+    return low + (FOUND_NATS - missed) / (found - missed) * (high - low)
 
 
 def needed_nats(healthy_odds: float) -> float:
@@ -167,26 +188,6 @@ def needed_nats(healthy_odds: float) -> float:
     """
     against = max(0.0, float(np.log(healthy_odds)))
     return 0.25 * float(np.sqrt(FOUND_NATS) + np.sqrt(FOUND_NATS + 4.0 * against)) ** 2
-
-
-def _bracket(sizes: FloatArray, nats: FloatArray) -> FloatArray:
-    """Return sizes between the largest that is not found and the next, none if there is none."""
-    missed = np.flatnonzero(nats < FOUND_NATS)
-    if len(missed) == 0 or missed[-1] == len(sizes) - 1:
-        return np.empty(0)
-    return np.geomspace(sizes[missed[-1]], sizes[missed[-1] + 1], SIZES + 2)[1:-1]
-
-
-def _crossing(sizes: FloatArray, nats: FloatArray) -> float | None:
-    """Return the size from which on a fault is found; None if the largest is not."""
-    missed = np.flatnonzero(nats < FOUND_NATS)
-    if len(missed) == 0:
-        return float(sizes[0])
-    last = missed[-1]
-    if last == len(sizes) - 1:
-        return None
-    share = (FOUND_NATS - nats[last]) / (nats[last + 1] - nats[last])
-    return float(sizes[last] + share * (sizes[last + 1] - sizes[last]))
 
 
 APART_NATS = 3.0
@@ -234,6 +235,7 @@ def isolability(
     hypotheses: Sequence[Hypothesis | str] | None = None,
     priors: Priors | None = None,
     onset_s: float = 0.0,
+    on_progress: Callable[[int], None] = lambda faults: None,
 ) -> IsolabilityReport:
     """Return what a planned motion can tell apart; nothing needs to be measured.
 
@@ -249,6 +251,7 @@ def isolability(
             classes.
         priors: Ranges of sizes that are considered; None: the default.
         onset_s: When faults begin [s]; 0: they are there before the motion.
+        on_progress: Called with the number of further faults whose smallest size is known.
 
     Raises:
         InputError: If nothing moves, the shapes do not fit, the onset is not within the motion, or
@@ -266,7 +269,11 @@ def isolability(
     considered = {h: _sizes(h, judge) for h in judge.hypotheses}
     nats = trials.log_bayes_factor([(h, _typical(*sizes)) for h, sizes in considered.items()])
     sized = {h: sizes for h, sizes in considered.items() if np.isfinite(sizes).all()}
-    smallest = {str(h): minimum_detectable_sizes(trials, h, sizes) for h, sizes in sized.items()}
+    smallest = {}
+    for h in judge.hypotheses[1:]:
+        if h in sized:
+            smallest[str(h)] = minimum_detectable_sizes(trials, h, sized[h])
+        on_progress(1)
     names = tuple(str(h) for h in judge.hypotheses)
     return IsolabilityReport(
         hypotheses=names,

@@ -13,7 +13,7 @@ import click
 
 from failuretwin.app.commands import options as opt
 from failuretwin.app.commands.store import StoreOptions, recorded_option, store_options
-from failuretwin.app.terminal import show, tell, write_json
+from failuretwin.app.terminal import progress_bar, show, tell, write_json
 
 if TYPE_CHECKING:
     from failuretwin.app.remembering import RobotRecord
@@ -269,11 +269,12 @@ def isolability(
     motion = MotionOptions(hypotheses)
     checking = motion.checking(opt.SafetyOptions(), robot.known, robot.seed)
     model = checking.known.robot
-    found = (
-        checking.isolability_of(checking.random_motions())
-        if motions is None
-        else checking.isolability_in(motions)
-    )
+    if motions is None:
+        found = checking.isolability_of(checking.random_motions())
+    else:
+        faults = sum(bool(h.faults) for h in checking.asked)
+        with progress_bar("smallest faults", faults) as advance:
+            found = checking.isolability_in(motions, advance)
     remarks = [*reports.onset_lines(found), *reports.group_lines(found, model)]
     show(reports.size_table(found, model), *remarks)
     write_json(reports.isolability_records(found), output.json_file)

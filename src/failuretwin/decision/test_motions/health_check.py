@@ -257,13 +257,22 @@ class Checking:
         made = self.designer.sequence(self.home, seconds, most)
         return Motions.of(self.known.robot, made)
 
-    def isolability(self, command: FloatArray, time: FloatArray) -> IsolabilityReport:
+    def isolability(
+        self,
+        command: FloatArray,
+        time: FloatArray,
+        on_progress: Callable[[int], None] = lambda faults: None,
+    ) -> IsolabilityReport:
         """Return what motions can tell apart, by the priors of a check.
 
-        References are (sample, motor) or (run, sample, motor) [rad], at times (sample,) [s].
+        Args:
+            command: References, (sample, motor) or (run, sample, motor) [rad].
+            time: When, (sample,) [s].
+            on_progress: Called with the number of further faults, of all in `asked`.
         """
         known, priors = self.known, checking(self.model, self.asked)
-        return isolability(known.twin, command, time, known.imperfections, self.asked, priors)
+        what = self.asked, priors, 0.0, on_progress
+        return isolability(known.twin, command, time, known.imperfections, *what)
 
     def isolability_of(self, motions: Motions) -> IsolabilityReport:
         """Return the isolability of designed motions."""
@@ -275,7 +284,7 @@ class Checking:
         designer = replace(self, usual=True).designer
         return Motions.of(self.known.robot, designer.random(self.home, seconds, most))
 
-    def isolability_in(self, path: Path) -> IsolabilityReport:
+    def isolability_in(self, path: Path, on_progress: Callable[[int], None]) -> IsolabilityReport:
         """Return the isolability of motions in a file: designed ones, or those of a log."""
         from failuretwin.data_knowledge.readers.read import read_runs
 
@@ -284,7 +293,7 @@ class Checking:
         runs = read_runs(path, self.known.robot)
         subset = np.unique(np.linspace(0, runs.sizes["run"] - 1, MOST_RUNS).astype(np.int64))
         command = as_floats(runs["command"].values)[subset]
-        return self.isolability(command, as_floats(runs["time"].values))
+        return self.isolability(command, as_floats(runs["time"].values), on_progress)
 
     def shown(self, result: CheckResult, command: FloatArray, time: FloatArray) -> CheckResult:
         """Return a result with what its movements can show, where it says that all is well.
