@@ -20,6 +20,7 @@ from failuretwin.connection.calibration.parameters import (
     spring_remarks,
 )
 from failuretwin.connection.calibration.settling_fit import (
+    PAYLOADS_KG,
     best_payload,
     fit_settling,
 )
@@ -457,7 +458,9 @@ def test_no_payload_is_told_where_there_is_none(settle, armpi):
 def test_a_heavy_payload_on_a_precise_arm_is_told(settle, armpi):
     loaded = replace(TYPICAL, compliance=(0.0, 0.05, 0.05, 0.05), scatter=(3e-4,) * 4, payload=0.5)
     seen = settle(loaded, seed=10, movements=50, readings=False)
-    payload, told = best_payload(fit_settling(seen), armpi)
+    fits = []
+    payload, told = best_payload(fit_settling(seen), armpi, fits.append)
+    assert sum(fits) == len(PAYLOADS_KG)
     assert payload == 0.5
     assert "about 0.5 kg at the tool point" in told
 
@@ -466,9 +469,9 @@ def test_a_heavy_payload_on_a_precise_arm_is_told(settle, armpi):
 
 
 def test_unseen_sessions_are_left_with_the_scatter_alone(settle, armpi):
-    entries = cross_validate(
-        fit_settling(settle(TYPICAL, seed=11, movements=450, sessions=3)), armpi
-    )
+    whole, fits = fit_settling(settle(TYPICAL, seed=11, movements=450, sessions=3)), []
+    entries = cross_validate(whole, armpi, fits.append)
+    assert sum(fits) == 3
     assert [entry.session for entry in entries] == ["day_0", "day_1", "day_2"]
     # 1.48 times the median size of a Student t of this scale, plus what counts round off.
     size = 1.4826 * stats.t.ppf(0.75, TYPICAL.tail_dof)

@@ -63,6 +63,7 @@ def calibrate(
         write_calibration_page,
     )
     from failuretwin.connection.calibration import step_parameters
+    from failuretwin.connection.calibration.calibrate import number_of_fits
     from failuretwin.connection.calibration.result import check_calibration_file
 
     name = name or out.stem
@@ -81,7 +82,8 @@ def calibrate(
     source = ", ".join(map(str, reading.logs))
     wrong = _wrong_set_up(runs, model)
     try:
-        found = ft.calibrate(runs, model, name, source, hold_out)
+        with progress_bar("calibrating", number_of_fits(runs, hold_out)) as advance:
+            found = ft.calibrate(runs, model, name, source, hold_out, advance)
     except InputError as error:
         if not wrong:
             raise

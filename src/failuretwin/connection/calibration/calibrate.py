@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,6 +38,7 @@ from failuretwin.connection.calibration.sensor_fit import (
     fit_sensors,
 )
 from failuretwin.connection.calibration.settling_fit import (
+    PAYLOADS_KG,
     SettlingFit,
     best_payload,
     fit_settling,
@@ -100,6 +101,7 @@ def fit_calibration(
     fault_probability: FloatArray | None = None,
     judged: RunSet | None = None,
     thorough: bool = True,
+    on_progress: Callable[[int], None] = lambda fits: None,
 ) -> Calibration:
     """Learn the imperfections of a robot from healthy runs.
 
@@ -113,6 +115,7 @@ def fit_calibration(
         judged: Healthy runs of sessions that only say how good the fit is; None: each session is
             left out once and judged by a fit to the others.
         thorough: Whether to check the fit on sessions that it has not seen, and the payload.
+        on_progress: Called with the number of further fits.
 
     Raises:
         InputError: If too few movements come to rest near their targets.
@@ -123,9 +126,10 @@ def fit_calibration(
     out = {entry.run for entry in left_out}
     kept = runs.isel(run=[i for i, run in enumerate(names) if run not in out])
     part = fit_settling(observe(kept, robot))
+    on_progress(1)
     payload, remarks = 0.0, list[str]()
     if thorough:
-        payload, told = best_payload(part, robot)
+        payload, told = best_payload(part, robot, on_progress)
         remarks = [told]
         if payload > 0.0:
             model = uncalibrated(robot, part.observations.of_motors, payload=payload)
@@ -164,7 +168,7 @@ def fit_calibration(
         movements=int(np.sum(part.fitted)),
         used_readings=part.observations.of_motors,
         left_out=(*left_out, *part.left_out(robot)),
-        held_out=_held_out(part, robot, judged) if thorough else (),
+        held_out=_held_out(part, robot, judged, on_progress) if thorough else (),
         remarks=(
             *remarks,
             *part.remarks(),
@@ -174,9 +178,14 @@ def fit_calibration(
     )
 
 
-def _held_out(part: SettlingFit, robot: Robot, judged: RunSet | None) -> tuple[HeldOut, ...]:
+def _held_out(
+    part: SettlingFit,
+    robot: Robot,
+    judged: RunSet | None,
+    on_progress: Callable[[int], None],
+) -> tuple[HeldOut, ...]:
     if judged is None:
-        return cross_validate(part, robot)
+        return cross_validate(part, robot, on_progress)
     unseen = observe(judged, robot)
     entries = [
         judge(unseen[np.flatnonzero(unseen.session == index)], part, robot, name)
@@ -224,6 +233,7 @@ def calibrate(
     name: str = "calibrated",
     source: str = "",
     hold_out: str | None = None,
+    on_progress: Callable[[int], None] = lambda fits: None,
 ) -> Calibration:
     """Calibrate a robot from logs that should be healthy.
 
@@ -234,6 +244,7 @@ def calibrate(
         source: Which logs these are.
         hold_out: Text in the names of sessions that are not learned from, only judged; None: all
             sessions are learned from, and each is judged by a fit to the others.
+        on_progress: Called with the number of further fits, of `number_of_fits` about.
 
     Raises:
         InputError: If the logs are labelled faulty or look so, or too few movements are left.
@@ -248,16 +259,35 @@ def calibrate(
         return replace(_of_the_way(runs, robot, name, source), left_out=labelled)
     inside = _held_out_runs(runs, hold_out)
     learning = runs.isel(run=np.flatnonzero(~inside))
-    first = fit_calibration(learning, robot, name, source, thorough=False)
+    first = fit_calibration(learning, robot, name, source, thorough=False, on_progress=on_progress)
     _refuse_scatter(first, robot)
     doubt = fault_probabilities(learning, robot, first.imperfections)
     _refuse_suspects(learning, doubt)
     judged = runs.isel(run=np.flatnonzero(inside)) if inside.any() else None
-    found = fit_calibration(learning, robot, name, source, fault_probability=doubt, judged=judged)
+    found = fit_calibration(
+        learning,
+        robot,
+        name,
+        source,
+        fault_probability=doubt,
+        judged=judged,
+        on_progress=on_progress,
+    )
     _refuse_left_out(found)
     found = replace(found, left_out=(*labelled, *found.left_out))
     model = HealthyModel.of(found.applied_to(robot).twin, found.imperfections)
     return _with_sensors(found, fit_sensors(learning, model))
+
+
+def number_of_fits(runs: RunSet, hold_out: str | None) -> int:
+    """Return how many fits a calibration takes: to be trusted or not, payloads, sessions left out.
+
+    Args:
+        runs: The logs.
+        hold_out: As of `calibrate`.
+    """
+    sessions = len(set(session_names(runs))) if hold_out is None else 0
+    return 2 + len(PAYLOADS_KG) + sessions
 
 
 def _with_sensors(found: Calibration, fits: Sequence[SensorFit]) -> Calibration:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,10 +32,19 @@ TO_DEVIATION = 1.4826
 """Median absolute deviation to standard deviation of a normal distribution."""
 
 
-def cross_validate(part: SettlingFit, robot: Robot) -> tuple[HeldOut, ...]:
-    """Return how well the other sessions predict each session; empty with one session alone."""
+def cross_validate(
+    part: SettlingFit, robot: Robot, on_progress: Callable[[int], None] = lambda fits: None
+) -> tuple[HeldOut, ...]:
+    """Return how well the other sessions predict each session; empty with one session alone.
+
+    Args:
+        part: The fit to all sessions.
+        robot: The robot.
+        on_progress: Called with the number of further sessions that were looked at.
+    """
     found, seen = [], part.observations
     for index, name in enumerate(seen.sessions):
+        on_progress(1)
         inside = seen.session == index
         if not inside.any() or inside.all():
             continue

@@ -9,6 +9,7 @@ Section: docs/inference.md#calibration-and-geometry
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -258,18 +259,27 @@ PAYLOADS_KG = (0.02, 0.1, 0.5, 2.0)
 """Masses at the tool point that are tried [kg]."""
 
 
-def best_payload(part: SettlingFit, robot: Robot) -> tuple[float, str]:
+def best_payload(
+    part: SettlingFit, robot: Robot, on_progress: Callable[[int], None] = lambda fits: None
+) -> tuple[float, str]:
     """Return the payload that the logs speak for [kg] and a sentence about it.
 
     Compliance can take up most of what a payload does, so it is 0 unless the logs are sure.
+
+    Args:
+        part: The fit without a payload.
+        robot: The robot.
+        on_progress: Called with the number of further payloads that were tried.
     """
     sag = np.abs(np.asarray(part.settling.compliance) * largest_load(robot, 0.0))
     if sag.max() < LEAST_SAG_RAD:
         return 0.0, "payload: the motors do not give way, so none can be told"
     seen = part.observations
-    loaded = [uncalibrated(robot, seen.of_motors, payload=kg) for kg in PAYLOADS_KG]
-    gain = np.array([fit_settling(seen.of(model)).log_posterior for model in loaded])
-    gain -= part.log_posterior
+    gain = np.full(len(PAYLOADS_KG), -part.log_posterior)
+    for i, kg in enumerate(PAYLOADS_KG):
+        loaded = uncalibrated(robot, seen.of_motors, payload=kg)
+        gain[i] += fit_settling(seen.of(loaded)).log_posterior
+        on_progress(1)
     best = int(np.argmax(gain))
     if gain[best] > SURE_NATS:
         kg = PAYLOADS_KG[best]
