@@ -14,7 +14,6 @@ Section: docs/fleet.md#simulated-years
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -23,6 +22,7 @@ import numpy as np
 
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
+from failuretwin.core.progress import Progress
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
 from failuretwin.data_knowledge.records.episodes import CONFIRMED
 from failuretwin.data_knowledge.records.history import WRONG
@@ -166,7 +166,7 @@ def _as_it_is(
 
 
 def write_years(
-    store: Store, years: Years, robots: int, workforce: Workforce, advance: Callable[[int], None]
+    store: Store, years: Years, robots: int, workforce: Workforce, advance: Progress
 ) -> str:
     """Simulate robots and write their lives into a store, and return what was written.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from failuretwin.core.foreign import printable
+from failuretwin.core.progress import Progress
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -128,20 +129,20 @@ REPORT_EVERY_S = 5.0
 
 
 @contextmanager
-def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
+def progress_bar(what: str, total: int) -> Iterator[Progress]:
     """Give a function to call with the number of steps just done, of `total` in all."""
     if not sys.stderr.isatty():
         yield _progress_lines(what, total)
         return
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import Progress as Bar
 
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(what, total=total)
-        yield lambda steps: progress.advance(task, steps)
+    with Bar(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda steps: bar.advance(task, steps)
 
 
-def _progress_lines(what: str, total: int) -> Callable[[int], None]:
+def _progress_lines(what: str, total: int) -> Progress:
     """Return a function that writes done, total and time left to stderr every few seconds."""
     begun_s = reported_s = time.monotonic()
     done = 0

@@ -24,6 +24,7 @@ from failuretwin.core.errors import InputError, counted
 from failuretwin.core.foreign import check_memory
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.movements import Movements
+from failuretwin.core.progress import Progress, unseen
 from failuretwin.core.runs import RunSet, check_motors, truths_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
@@ -61,7 +62,6 @@ from failuretwin.inference.observation.registered import (
 from failuretwin.inference.set_ups.set_ups import FAR_OFF, FAULT_OF_EVERY_RUN
 from failuretwin.inference.together.fault_course import FaultCourse
 from failuretwin.inference.together.folder_posterior import (
-    Advance,
     FolderPosterior,
     folder_posterior,
 )
@@ -153,7 +153,7 @@ class SelfCalibratingDiagnoser:
         """
         return list(self.learn(runs).diagnoses)
 
-    def learn(self, runs: RunsLike, advance: Advance = lambda passes: None) -> SelfCalibration:
+    def learn(self, runs: RunsLike, advance: Progress = unseen) -> SelfCalibration:
         """Return the diagnoses, and what the runs teach of the robot.
 
         Args:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +34,7 @@ from failuretwin.core.config import fingerprint
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.foreign import read_text, reading
 from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.progress import Progress, unseen
 from failuretwin.core.runs import RunSet, check_motors, truths_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.readers.file_claims import check_npz
@@ -140,7 +141,7 @@ def diagnose_tracked(
     runs: RunSet,
     diagnoser: BayesDiagnoser,
     history: History,
-    advance: Callable[[int], None] = lambda done: None,
+    advance: Progress = unseen,
 ) -> Tracked:
     """Diagnose runs, oldest first, each by what those before it teach; writes nothing.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import parent_process
@@ -28,6 +28,7 @@ from failuretwin.core.hypothesis import (
     parse_hypotheses,
 )
 from failuretwin.core.movements import Movements, stack_movements
+from failuretwin.core.progress import Progress, unseen
 from failuretwin.core.runs import STEP_S, RunSet, RunTable, Truth, concatenate
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.signals import SIMULATED, drive_of, simulated_sensors
@@ -331,7 +332,7 @@ def iterate(
 def simulate(
     plan: Plan,
     workers: int = 1,
-    on_progress: Callable[[int], None] = lambda runs: None,
+    on_progress: Progress = unseen,
     scheduler: str | None = None,
 ) -> RunSet:
     """Simulate all runs of a plan in memory; `resumable.produce` has no need to hold them.

@@ -21,6 +21,7 @@ from typing import Any
 from failuretwin import __version__
 from failuretwin.core.config import fingerprint
 from failuretwin.core.errors import FailureTwinError, InputError, OutputError, reason
+from failuretwin.core.progress import Progress
 from failuretwin.data_knowledge.store import atomic_replace, sole_writer
 from failuretwin.data_knowledge.workers import Workforce
 
@@ -111,7 +112,7 @@ class Unfinished(ABC):
         self,
         path: Path,
         workforce: Workforce,
-        on_progress: Callable[[int], None],
+        on_progress: Progress,
         tell: Callable[[str], None],
     ) -> None:
         """Make all missing pieces, and put the result in the place of `path`.
@@ -165,7 +166,7 @@ class Unfinished(ABC):
     def _make_missing(
         self,
         workforce: Workforce,
-        on_progress: Callable[[int], None],
+        on_progress: Progress,
         tell: Callable[[str], None],
     ) -> str:
         """Make every piece that is missing; return the hash of all."""

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from failuretwin.core.errors import InputError
+from failuretwin.core.progress import Progress, unseen
 from failuretwin.core.runs import VARIABLES
 from failuretwin.data_knowledge.generate import CHUNK_RUNS, Plan, simulate, simulate_runs
 from failuretwin.data_knowledge.pieces import Unfinished, hidden_folder, versions
@@ -41,7 +42,7 @@ def produce(
     plan: Plan,
     path: Path,
     workforce: Workforce = ONE_PROCESS,
-    on_progress: Callable[[int], None] = lambda runs: None,
+    on_progress: Progress = unseen,
     tell: Callable[[str], None] = lambda text: None,
     chunk_runs: int = CHUNK_RUNS,
 ) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 from failuretwin.core.config import fingerprint
 from failuretwin.core.errors import OutputError
+from failuretwin.core.progress import Progress, unseen
 from failuretwin.core.runs import unique_names
 from failuretwin.data_knowledge.pieces import Unfinished, hidden_folder, versions
 from failuretwin.data_knowledge.readers.read import ReadOptions
@@ -47,7 +48,7 @@ def diagnose_to_parquet(
     correction: LogCorrection | None = None,
     workers: int = 1,
     scheduler: str | None = None,
-    on_progress: Callable[[int], None] = lambda runs: None,
+    on_progress: Progress = unseen,
     tell: Callable[[str], None] = lambda text: None,
 ) -> None:
     """Diagnose runs of any number into a folder of parquet files; continue interrupted work.

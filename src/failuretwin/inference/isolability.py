@@ -26,6 +26,7 @@ from failuretwin.core.hypothesis import (
     parse_hypotheses,
 )
 from failuretwin.core.movements import find_movements
+from failuretwin.core.progress import Progress, unseen
 from failuretwin.core.runs import RunTable
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
@@ -235,7 +236,7 @@ def isolability(
     hypotheses: Sequence[Hypothesis | str] | None = None,
     priors: Priors | None = None,
     onset_s: float = 0.0,
-    on_progress: Callable[[int], None] = lambda faults: None,
+    on_progress: Progress = unseen,
 ) -> IsolabilityReport:
     """Return what a planned motion can tell apart; nothing needs to be measured.
 

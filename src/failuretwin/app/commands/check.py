@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -14,6 +14,7 @@ import click
 from failuretwin.app.commands import options as opt
 from failuretwin.app.commands.store import StoreOptions, recorded_option, store_options
 from failuretwin.app.terminal import progress_bar, show, tell, write_json
+from failuretwin.core.progress import Progress
 
 if TYPE_CHECKING:
     from failuretwin.app.remembering import RobotRecord
@@ -155,7 +156,8 @@ def check(
         commander = commander_of(arm, checking.known, robot.seed, stack)
         result = checking.carry_out(planned, further, commander, tell)
     time, command = planned.reference()
-    result = checking.shown(result, command, time)
+    with _smallest_faults(checking) as advance:
+        result = checking.shown(result, command, time, advance)
     record = reports.check_record(result, model, planned.duration_s)
     show(*reports.check_lines(result, model, planned.duration_s))
     if keep is not None:
@@ -167,6 +169,11 @@ def check(
     show(*reports.closing_lines(result, model))
     if stored is not None:
         show("", *stored.remember_check([result]))
+
+
+def _smallest_faults(checking: Checking, sets: int = 1) -> AbstractContextManager[Progress]:
+    """Give what is told of the progress of the smallest faults that sets of motions show."""
+    return progress_bar("smallest faults", sets * sum(bool(h.faults) for h in checking.asked))
 
 
 def _refuse_unused(
@@ -241,8 +248,10 @@ def design(
     planned = checking.motions(motion.seconds, None, movements)
     lines = motion_lines(planned, checking.known.robot, written)
     random = checking.random_motions(planned.duration_s, len(planned.orders))
-    found = checking.isolability_of(planned), checking.isolability_of(random)
-    show(*lines, compared_table(*found, checking.known.robot))
+    with _smallest_faults(checking, 2) as advance:
+        designed = checking.isolability_of(planned, advance)
+        drawn = checking.isolability_of(random, advance)
+    show(*lines, compared_table(designed, drawn, checking.known.robot))
 
 
 @click.command()
@@ -269,12 +278,12 @@ def isolability(
     motion = MotionOptions(hypotheses)
     checking = motion.checking(opt.SafetyOptions(), robot.known, robot.seed)
     model = checking.known.robot
-    if motions is None:
-        found = checking.isolability_of(checking.random_motions())
-    else:
-        faults = sum(bool(h.faults) for h in checking.asked)
-        with progress_bar("smallest faults", faults) as advance:
-            found = checking.isolability_in(motions, advance)
+    with _smallest_faults(checking) as advance:
+        found = (
+            checking.isolability_of(checking.random_motions(), advance)
+            if motions is None
+            else checking.isolability_in(motions, advance)
+        )
     remarks = [*reports.onset_lines(found), *reports.group_lines(found, model)]
     show(reports.size_table(found, model), *remarks)
     write_json(reports.isolability_records(found), output.json_file)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,6 +54,7 @@ from failuretwin.connection.calibration.timing_fit import (
 from failuretwin.connection.population import stated_variation
 from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
 from failuretwin.core.errors import InputError
+from failuretwin.core.progress import Progress, unseen
 from failuretwin.core.runs import RunSet, check_motors, truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
@@ -101,7 +102,7 @@ def fit_calibration(
     fault_probability: FloatArray | None = None,
     judged: RunSet | None = None,
     thorough: bool = True,
-    on_progress: Callable[[int], None] = lambda fits: None,
+    on_progress: Progress = unseen,
 ) -> Calibration:
     """Learn the imperfections of a robot from healthy runs.
 
@@ -182,7 +183,7 @@ def _held_out(
     part: SettlingFit,
     robot: Robot,
     judged: RunSet | None,
-    on_progress: Callable[[int], None],
+    on_progress: Progress,
 ) -> tuple[HeldOut, ...]:
     if judged is None:
         return cross_validate(part, robot, on_progress)
@@ -233,7 +234,7 @@ def calibrate(
     name: str = "calibrated",
     source: str = "",
     hold_out: str | None = None,
-    on_progress: Callable[[int], None] = lambda fits: None,
+    on_progress: Progress = unseen,
 ) -> Calibration:
     """Calibrate a robot from logs that should be healthy.
 

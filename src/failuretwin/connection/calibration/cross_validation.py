@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +19,7 @@ from failuretwin.connection.calibration.settling_fit import (
 )
 from failuretwin.core.errors import InputError
 from failuretwin.core.numerics import log_student
+from failuretwin.core.progress import Progress, unseen
 from failuretwin.core.runs import RunSet
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.arm_classes import generic_imperfections
@@ -33,7 +33,7 @@ TO_DEVIATION = 1.4826
 
 
 def cross_validate(
-    part: SettlingFit, robot: Robot, on_progress: Callable[[int], None] = lambda fits: None
+    part: SettlingFit, robot: Robot, on_progress: Progress = unseen
 ) -> tuple[HeldOut, ...]:
     """Return how well the other sessions predict each session; empty with one session alone.
 

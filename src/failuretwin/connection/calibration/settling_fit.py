@@ -9,7 +9,6 @@ Section: docs/inference.md#calibration-and-geometry
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,6 +18,7 @@ from failuretwin.connection.calibration.observations import Observations, uncali
 from failuretwin.connection.calibration.result import LeftOut
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY
+from failuretwin.core.progress import Progress, unseen
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, largest_load
@@ -260,7 +260,7 @@ PAYLOADS_KG = (0.02, 0.1, 0.5, 2.0)
 
 
 def best_payload(
-    part: SettlingFit, robot: Robot, on_progress: Callable[[int], None] = lambda fits: None
+    part: SettlingFit, robot: Robot, on_progress: Progress = unseen
 ) -> tuple[float, str]:
     """Return the payload that the logs speak for [kg] and a sentence about it.
 

@@ -13,6 +13,7 @@ from typing import TypeAlias, cast
 from failuretwin import __version__
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
+from failuretwin.core.progress import Progress, unseen
 from failuretwin.core.runs import RunSet, concatenate
 from failuretwin.data_knowledge.readers.bag_file import is_bag
 from failuretwin.data_knowledge.readers.bag_messages import BagTopics
@@ -118,7 +119,7 @@ def read_logs(
     robot: Robot,
     options: ReadOptions,
     workforce: Workforce = ONE_PROCESS,
-    on_progress: Callable[[int], None] = lambda logs: None,
+    on_progress: Progress = unseen,
 ) -> RunSet:
     """Return the runs of some logs as one run set.
 

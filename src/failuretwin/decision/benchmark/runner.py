@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from failuretwin import __version__
 from failuretwin.core.config import from_table
 from failuretwin.core.errors import InputError, check_name, counted
 from failuretwin.core.foreign import read_text, reading
+from failuretwin.core.progress import Progress
 from failuretwin.core.runs import concatenate
 from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import write_text
@@ -174,7 +175,7 @@ def wanted_work(
 
 
 def run_entry(
-    method: str, work: Sequence[Work], out: Path, on_progress: Callable[[int], None]
+    method: str, work: Sequence[Work], out: Path, on_progress: Progress
 ) -> dict[str, Any]:
     """Answer the cases that have no answers yet in `out`; return and write the results of all.
 

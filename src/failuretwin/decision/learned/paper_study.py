@@ -26,6 +26,7 @@ from failuretwin import __version__
 from failuretwin.core.config import fingerprint, from_table
 from failuretwin.core.errors import FailureTwinError, InputError, OutputError, counted, reason
 from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.progress import Progress
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate
@@ -184,9 +185,7 @@ class Training:
     seconds: float
 
 
-def run_all(
-    plan: StudyPlan, folder: Path, classes: int, on_progress: Callable[[int], None]
-) -> list[Training]:
+def run_all(plan: StudyPlan, folder: Path, classes: int, on_progress: Progress) -> list[Training]:
     """Run the trainings without a result in `folder`; return all results.
 
     `on_progress` receives numbers of finished trainings, including those of earlier attempts.
@@ -200,9 +199,7 @@ def run_all(
     return [from_table(Training, json.loads(f.read_text(encoding="utf-8")), str(f)) for f in files]
 
 
-def spread(
-    work: Callable[[J], None], jobs: Sequence[J], on_progress: Callable[[int], None]
-) -> None:
+def spread(work: Callable[[J], None], jobs: Sequence[J], on_progress: Progress) -> None:
     """Run jobs in processes of their own, one per core at a time."""
     import torch
 
@@ -370,7 +367,7 @@ def check_folder(folder: Path, resume: bool) -> None:
 
 
 def run_study(
-    plan: StudyPlan, robot: Robot, test: Exam, folder: Path, on_progress: Callable[[int], None]
+    plan: StudyPlan, robot: Robot, test: Exam, folder: Path, on_progress: Progress
 ) -> list[Training]:
     """Run what is missing of a study in a folder that `check_folder` accepted."""
     begin(plan, robot, test, folder, make_arrays)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.progress import Progress
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import load_run_set, replacing, save_run_set, write_text
@@ -108,9 +109,7 @@ def views_of(runs: xr.Dataset) -> list[xr.Dataset]:
 # One job.
 
 
-def run_rivals(
-    plan: RivalPlan, robot: Robot, exam: Exam, out: Path, on_progress: Callable[[int], None]
-) -> None:
+def run_rivals(plan: RivalPlan, robot: Robot, exam: Exam, out: Path, on_progress: Progress) -> None:
     """Run the jobs without a result; those that go on from others come last."""
     begin(plan, robot, exam, out, make_rival_data)
     jobs, folder = rival_jobs(plan), out / WORK

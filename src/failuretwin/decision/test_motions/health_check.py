@@ -26,6 +26,7 @@ from failuretwin.core.hypothesis import (
     motor_probabilities,
     paper_hypotheses,
 )
+from failuretwin.core.progress import Progress, unseen
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.decision.acting.belief import settled_evidence_of, shown_faults
 from failuretwin.decision.acting.believed_arm import Seen
@@ -258,10 +259,7 @@ class Checking:
         return Motions.of(self.known.robot, made)
 
     def isolability(
-        self,
-        command: FloatArray,
-        time: FloatArray,
-        on_progress: Callable[[int], None] = lambda faults: None,
+        self, command: FloatArray, time: FloatArray, on_progress: Progress = unseen
     ) -> IsolabilityReport:
         """Return what motions can tell apart, by the priors of a check.
 
@@ -274,35 +272,41 @@ class Checking:
         what = self.asked, priors, 0.0, on_progress
         return isolability(known.twin, command, time, known.imperfections, *what)
 
-    def isolability_of(self, motions: Motions) -> IsolabilityReport:
+    def isolability_of(self, motions: Motions, on_progress: Progress = unseen) -> IsolabilityReport:
         """Return the isolability of designed motions."""
         time, command = motions.reference()
-        return self.isolability(command, time)
+        return self.isolability(command, time, on_progress)
 
     def random_motions(self, seconds: float = RANDOM_S, most: int = 1000) -> Motions:
         """Return random movements within the usual ranges, at most `seconds` long [s]."""
         designer = replace(self, usual=True).designer
         return Motions.of(self.known.robot, designer.random(self.home, seconds, most))
 
-    def isolability_in(self, path: Path, on_progress: Callable[[int], None]) -> IsolabilityReport:
+    def isolability_in(self, path: Path, on_progress: Progress = unseen) -> IsolabilityReport:
         """Return the isolability of motions in a file: designed ones, or those of a log."""
         from failuretwin.data_knowledge.readers.read import read_runs
 
         if holds_motions(path, self.known.robot):
-            return self.isolability_of(read_motions(path, self.known.robot))
+            return self.isolability_of(read_motions(path, self.known.robot), on_progress)
         runs = read_runs(path, self.known.robot)
         subset = np.unique(np.linspace(0, runs.sizes["run"] - 1, MOST_RUNS).astype(np.int64))
         command = as_floats(runs["command"].values)[subset]
         return self.isolability(command, as_floats(runs["time"].values), on_progress)
 
-    def shown(self, result: CheckResult, command: FloatArray, time: FloatArray) -> CheckResult:
+    def shown(
+        self,
+        result: CheckResult,
+        command: FloatArray,
+        time: FloatArray,
+        on_progress: Progress = unseen,
+    ) -> CheckResult:
         """Return a result with what its movements can show, where it says that all is well.
 
         References of its movements are (run, sample, motor) [rad], at times (sample,) [s].
         """
         if result.light != GREEN:
             return result
-        return replace(result, shown=self.isolability(command, time))
+        return replace(result, shown=self.isolability(command, time, on_progress))
 
     def of_logs(self, paths: Sequence[Path]) -> list[CheckResult]:
         """Return what logs of a check say that was made elsewhere, a result a run."""

@@ -7,12 +7,13 @@ Section: docs/inference.md#folders
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.progress import Progress, unseen
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.engine.registration import (
     displaced_components,
@@ -48,8 +49,6 @@ OPEN = AS_HEALTHY + 2
 """Pass from which hypotheses that are out of the question for a run are left out of the next."""
 DAMPING = 0.7
 """Share of a new site that is taken, from the second pass on."""
-Advance = Callable[[int], None]
-"""Told how many passes over the runs have just been done, of `PASSES`; more are not told."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,7 @@ def folder_posterior(
     likelihood: RunLikelihood,
     hypotheses: Sequence[Hypothesis],
     priors: Priors,
-    advance: Advance = lambda passes: None,
+    advance: Progress = unseen,
 ) -> FolderPosterior:
     """Weigh every hypothesis by each run, with what all runs say of what they share.
 
@@ -104,7 +103,7 @@ def folder_posterior(
         likelihood: The runs; the doubt of their model is the prior of theta.
         hypotheses: What may be the case.
         priors: Beliefs about faults and set-ups.
-        advance: Told of progress.
+        advance: Called with the number of further passes, of `PASSES`; more are not told.
     """
     together, usual = begun(likelihood, hypotheses, priors)
     rows, moved, likely = np.arange(together.runs), np.inf, None
