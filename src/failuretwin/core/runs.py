@@ -321,7 +321,7 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     """Return one run set of all runs in `parts`, padded to the longest, with unique names.
 
     Variables missing in any part are dropped; repeated run names get a number. The lowest sensor
-    rate is kept, so that no reading counts twice.
+    rate is kept, so that no reading counts twice. All are put on the finest of their time grids.
     """
     import xarray as xr
 
@@ -331,7 +331,10 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     if len(parts) == 1:
         return first
     for part in parts[1:]:
-        _check_same_kind(first, part)
+        _check_same_motors(first, part)
+    rate_hz, step = min(map(measured_rate, parts)), min(map(time_step, parts))
+    parts = [_on_step(part, step) for part in parts]
+    first = parts[0]
     length = max(part.sizes["time"] for part in parts)
     longest = next(part for part in parts if part.sizes["time"] == length)
     shared = [n for n in first.data_vars if all(n in part for part in parts)]
@@ -344,7 +347,7 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         {name: longest[name] for name in first.coords if name in first.dims and name != "run"},
         first.attrs,
     )
-    whole.attrs["measured_rate_hz"] = min(measured_rate(part) for part in parts)
+    whole.attrs["measured_rate_hz"] = rate_hz
     names = [str(name) for part in parts for name in part["run"].values]
     return whole.assign_coords(run=np.asarray(unique_names(names), dtype=object))
 
@@ -354,16 +357,42 @@ def padded_bytes(runs: int, samples: int, motors: int) -> float:
     return 8.0 * runs * samples * (2 * motors + len(AXES))
 
 
-def _check_same_kind(first: xr.Dataset, other: xr.Dataset) -> None:
+def _check_same_motors(first: xr.Dataset, other: xr.Dataset) -> None:
     motors = [list(map(str, part["motor"].values)) for part in (first, other)]
     if motors[0] != motors[1]:
         raise InputError(f"runs with motors {motors[0]} and {motors[1]} cannot form one run set.")
-    step, other_step = time_step(first), time_step(other)
-    if not np.isclose(step, other_step, rtol=UNIFORM):
-        raise InputError(
-            f"runs with time steps of {step:g} and {other_step:g} s cannot form one run set. "
-            "Read or diagnose them separately."
-        )
+
+
+def _on_step(runs: xr.Dataset, step: float) -> xr.Dataset:
+    """Return runs on a time grid that is as fine or finer, with a step in seconds.
+
+    Commands go straight on between samples; readings are at the nearest time.
+    """
+    if np.isclose(time_step(runs), step, rtol=UNIFORM):
+        return runs
+    time = as_floats(runs["time"].values)
+    place = np.rint((time - time[0]) / step).astype(np.int64)
+    grid = time[0] + step * np.arange(place[-1] + 1)
+
+    def told(values: FloatArray) -> FloatArray:
+        return np.asarray(np.interp(grid, time, values))
+
+    def read(values: FloatArray) -> FloatArray:
+        found = np.full(len(grid), np.nan)
+        found[place] = values
+        return found
+
+    timed = {
+        name: (of.dims, np.apply_along_axis(move, of.dims.index("time"), of.values), of.attrs)
+        for name, of in runs.data_vars.items()
+        if "time" in of.dims
+        for move in [told if name == "command" else read]
+    }
+    return (
+        runs.drop_vars([*timed, "time"])
+        .assign(timed)
+        .assign_coords(time=("time", grid, runs["time"].attrs))
+    )
 
 
 def _stacked(parts: Sequence[xr.DataArray], sizes: Mapping[str, int]) -> xr.Variable:
