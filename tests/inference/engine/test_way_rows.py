@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 import failuretwin as ft
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import find_movements
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import load_robot
 from failuretwin.failure_behavior.registry import MODES as MODES_BY_NAME
 from failuretwin.inference.engine.moments import moments_of
 from failuretwin.inference.engine.way_rows import FollowedWay, Ramps
+from failuretwin.inference.faults.prior_odds import prior_odds
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.on_the_way import on_the_way
@@ -143,6 +145,18 @@ def test_a_joint_with_play_is_found_on_a_curve():
     assert str(found.diagnosis) == "motor_2:backlash"
     assert found.magnitude == pytest.approx(0.14, abs=0.03)
     assert found.onset_90[0] - 0.1 <= 3.0 <= found.onset_90[1]  # it shows once it turns
+
+
+def test_missed_movements_do_not_show_on_a_curve_which_is_one():
+    _, command = curve()
+    late = broken(command, 1, 20, lambda way: command[: len(way), 1])
+    asked = ["healthy", "motor_2:lag", "motor_2:intermittent", "motor_2:lost_commands"]
+    for followed in (command, late):
+        runs = exact_run(ROBOT, command, followed)
+        (found,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=asked)
+        sound, _, *missed = (found.posterior[name] for name in asked)
+        odds = [prior_odds(Hypothesis.parse(name)) for name in asked[2:]]
+        assert np.divide(missed, sound) == pytest.approx(odds, rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -196,6 +196,10 @@ class Weighing:
         )
         table = found[rows, :, best][..., None] + more[:, None]
         table[..., self.with_rows] = found
+        curved = np.flatnonzero(self.evidence.scene.moments.on_curves.any(axis=1))
+        for h in np.flatnonzero([one.is_healthy for one in self.hypotheses]).tolist():
+            # A curve is one movement: a motor that misses some looks like a healthy one.
+            table[curved[:, None], :, self._missing] = table[curved, :, h][:, None]
         return np.asarray(table)
 
     @cached_property
