@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-import failuretwin as ft
 from bag_writers import MONITORING, MONITORING_TEXT, entry, write_bag
 from failuretwin.connection.emulated_arm import EmulatedArm, Emulation, Shifts
 from failuretwin.connection.links import replay as pace
@@ -169,9 +168,35 @@ def link(request, armpi, little_log, tmp_path):
         yield replay(bag(little_log, tmp_path, form), armpi, Pace(0.0))
 
 
-def test_a_table_is_refused_with_what_a_user_can_do(armpi):
-    with pytest.raises(InputError, match=r"for `diagnose`.*to a bag, or .* ft\.Source .*live\.md"):
-        replay(ft.sample_log(), armpi, Pace(0.0))
+def test_a_run_set_is_refused_with_what_a_user_can_do(armpi, tmp_path):
+    path = tmp_path / "runs.nc"
+    path.touch()
+    with pytest.raises(InputError, match=r"for `diagnose`.* write an ft\.Source .*live\.md"):
+        replay(path, armpi, Pace(0.0))
+
+
+def test_a_csv_file_of_one_run_is_replayed(armpi, tmp_path):
+    path, names = tmp_path / "log.csv", [f"command_{name}" for name in armpi.motor_names]
+    rows = np.random.default_rng(0).uniform(-0.5, 0.5, (30, len(names) + 3))
+    rows[10:20, : len(names)] = rows[9, : len(names)]  # told nothing new
+    lines = [",".join(["time", *names, "x", "y", "z"])]
+    lines += [",".join(map(repr, (0.05 * k, *row.tolist()))) for k, row in enumerate(rows)]
+    path.write_text("\n".join(lines))
+    source = replay(path, armpi, Pace(0.0))
+    events = []
+    while not source.ended:
+        events.append(source.poll(WAIT_S))
+    read = [e for e in events if isinstance(e, Reading)]
+    assert [e.time for e in read] == pytest.approx(0.05 * np.arange(30))
+    assert np.stack([e.tool for e in read]) == pytest.approx(rows[:, -3:])
+    sent = [e for e in events if isinstance(e, CommandSent)]
+    assert sent[-1].target == pytest.approx(rows[-1, : len(names)])
+    assert not [e for e in sent if 0.55 < e.time < 0.95]
+
+    of_two = [f"run,{lines[0]}", *(f"{k // 15},{line}" for k, line in enumerate(lines[1:]))]
+    path.write_text("\n".join(of_two))
+    with pytest.raises(InputError, match="holds 2 runs, expected one"):
+        replay(path, armpi, Pace(0.0))
 
 
 def fetch(source, count):

@@ -83,10 +83,10 @@ def watch(
     of others ends it.
 
     SOURCE is `ros1`, `ros2[://HOST[:PORT]]` (over Zenoh), `rosbridge://HOST[:PORT]`, `emulated` (a
-    robot simulated by physics), a log to replay (a raw session, a bag, a recording), or your own
-    source, MODULE:CLASS, a class that follows failuretwin.Source. On a ROS network the diagnosis is
-    published on /diagnostics. With --store each change is stored before it is printed. Stop with
-    Ctrl-C.
+    robot simulated by physics), a log to replay (a raw session, a CSV file, a bag, a recording), or
+    your own source, MODULE:CLASS, a class that follows failuretwin.Source. On a ROS network the
+    diagnosis is published on /diagnostics. With --store each change is stored before it is printed.
+    Stop with Ctrl-C.
     """
     from contextlib import ExitStack
 

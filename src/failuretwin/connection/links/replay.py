@@ -18,6 +18,7 @@ from failuretwin.data_knowledge.readers.bag_file import is_bag
 from failuretwin.data_knowledge.readers.bag_messages import BagTopics
 from failuretwin.data_knowledge.readers.bags import read_bag
 from failuretwin.data_knowledge.readers.raw_sessions import RawSession, find_sessions, read_session
+from failuretwin.data_knowledge.readers.read import is_text_log, text_logs
 from failuretwin.data_knowledge.readers.timed_log import Samples, Targets, TimedLog
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -96,33 +97,37 @@ class PacedSource(Source):
         return None
 
 
-FOR_TABLES = (
-    "Run sets and tables are for `diagnose`. To watch one, convert it to a bag, or write an "
-    "ft.Source that feeds its rows (docs/tutorials/live.md shows one)."
+FOR_RUN_SETS = (
+    "Run sets are for `diagnose`. To watch one, write an ft.Source that feeds its samples "
+    "(docs/tutorials/live.md shows one)."
 )
 """What to do with a log that cannot be watched."""
+WATCHED = "a raw session, a CSV file of one run, or a bag (.bag, .mcap, a folder of ROS 2)"
+"""What can be."""
 
 
 def replay(path: Path, robot: Robot, pace: Pace, topics: BagTopics | None = None) -> PacedSource:
-    """Return a log as a source: one raw session (a folder), a ROS 1 or ROS 2 bag or an MCAP file.
+    """Return a log as a source: a raw session (a folder), CSV file, ROS 1 or 2 bag or MCAP file.
 
     `topics` are the roles of a bag's topics, where types do not settle them.
 
     Raises:
-        InputError: If it does not exist, cannot be read, or holds several sessions.
+        InputError: If it does not exist, cannot be read, or holds several sessions or runs.
     """
     if not path.exists():
-        raise InputError(f"{path}: does not exist. Expected a raw session or a bag.")
+        raise InputError(f"{path}: does not exist. Expected {WATCHED}.")
     if is_bag(path):
         return PacedSource(path.name, log_events(read_bag(path, robot, topics), robot), pace)
+    if is_text_log(path):
+        logs = text_logs(path, robot)
+        if len(logs) != 1:
+            raise InputError(f"{path}: holds {len(logs)} runs, expected one. Cut it into files.")
+        return PacedSource(path.name, log_events(logs[0], robot), pace)
     folders = find_sessions(path) if path.is_dir() else []
     if len(folders) != 1:
-        found = f"holds {len(folders)} raw sessions" if folders else "is neither"
-        fix = "Name one of them." if folders else FOR_TABLES
-        raise InputError(
-            f"{path}: expected one raw session or a bag (.bag, .mcap, a folder of ROS 2), but it "
-            f"{found}. {fix}"
-        )
+        found = f"holds {len(folders)} raw sessions" if folders else "is none of these"
+        fix = "Name one of them." if folders else FOR_RUN_SETS
+        raise InputError(f"{path}: expected {WATCHED}, but it {found}. {fix}")
     session = read_session(folders[0], robot)
     return PacedSource(session.name, session_events(session, robot), pace)
 

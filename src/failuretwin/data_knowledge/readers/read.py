@@ -251,10 +251,20 @@ def _read_csv(path: Path, robot: Robot, options: ReadOptions) -> list[RunSet]:
     """Return the runs of a text file: by the column map, else by its header."""
     if options.columns is not None:
         return _log_datasets(options.columns.logs(path, robot), robot, "CSV with a column map")
+    source = RTDE_SOURCE if is_rtde(path) else "CSV, columns by their names"
+    return _log_datasets(text_logs(path, robot), robot, source)
+
+
+def is_text_log(path: Path) -> bool:
+    """Return whether a path is a CSV file or a recording of RTDE."""
+    return not path.is_dir() and (path.suffix == ".csv" or is_rtde(path))
+
+
+def text_logs(path: Path, robot: Robot) -> Sequence[TimedLog]:
+    """Return the logs in a CSV file, whose columns say by their names what they are, or of RTDE."""
     if is_rtde(path):
-        return _log_datasets([read_rtde(path, robot)], robot, RTDE_SOURCE)
-    logs = unambiguous_columns(path, robot).logs(path, robot)
-    return _log_datasets(logs, robot, "CSV, columns by their names")
+        return [read_rtde(path, robot)]
+    return unambiguous_columns(path, robot).logs(path, robot)
 
 
 READERS = (
@@ -265,7 +275,7 @@ READERS = (
         _read_matlab, lambda path: path.suffix == ".mat" and not path.is_dir(), find_matlab_files
     ),
     Reader(_read_lerobot, is_lerobot, find_lerobot),
-    Reader(_read_csv, lambda path: not path.is_dir() and (path.suffix == ".csv" or is_rtde(path))),
+    Reader(_read_csv, is_text_log),
 )
 """Readers of all kinds of logs; the first one that recognises a path reads it."""
 
