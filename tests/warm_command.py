@@ -12,6 +12,7 @@ import gc
 import importlib
 import json
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -98,6 +99,12 @@ class WarmCommand:
     def close(self):
         """End the server."""
         self._server.communicate()
+
+
+def remarks(stderr):
+    """Return what is said beside progress, which only slow machines show."""
+    progress = re.compile(r"[a-z -]+: (\d+ of \d+, about \d+ s left|\d+ s so far)")
+    return "".join(line for line in stderr.splitlines(True) if not progress.match(line))
 
 
 def _call_of(argv, folder, environment=None):

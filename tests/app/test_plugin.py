@@ -12,6 +12,7 @@ from failuretwin.core.hypothesis import parse_hypotheses
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from user_modes import code_on_the_page, registered_from
+from warm_command import remarks
 
 SHAFTS = [f"motor_{k}:bent_shaft" for k in (1, 2, 3)]
 OFFERED = [
@@ -75,7 +76,7 @@ def test_the_command_line_knows_it(failuretwin, folder):
         failuretwin(*command, folder / "bent_shaft.py", "--out", folder / "one.zarr"),
         failuretwin(*command, "bent_shaft", "--workers", 2, "--out", "two.zarr", folder=folder),
     ]
-    assert [answer.stderr for answer in made] == ["", ""]
+    assert [remarks(answer.stderr) for answer in made] == ["", ""]
     one, two = (
         {str(f.relative_to(path)): f.read_bytes() for f in path.rglob("*") if f.is_file()}
         for path in (folder / "one.zarr", folder / "two.zarr")
@@ -85,7 +86,7 @@ def test_the_command_line_knows_it(failuretwin, folder):
     options = ("--plugin", "bent_shaft", "--hypotheses", offered, "--json", "said.jsonl")
     save_run_set(load_run_set(folder / "one.zarr").isel(run=slice(32, 38)), folder / "some.nc")
     answer = failuretwin("diagnose", "some.nc", *options, folder=folder)
-    assert answer.stderr == ""
+    assert remarks(answer.stderr) == ""
     said = [json.loads(line) for line in (folder / "said.jsonl").read_text().splitlines()]
     bent = [s for s in said if s["truth"] == s["diagnosis"] == "motor_2:bent_shaft"]
     assert len(bent) >= 3

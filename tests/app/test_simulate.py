@@ -9,13 +9,9 @@ import time
 import pytest
 
 from waiting import WAIT_S
+from warm_command import remarks
 
 COMMAND = ("simulate", "--runs-per-class", 30, "--calibration", "armpi_fpv", "--out")
-
-
-def remarks(stderr):
-    """Return what is said beside progress, which only slow machines show."""
-    return "".join(line for line in stderr.splitlines(True) if not line.startswith("simulating: "))
 
 
 def contents(folder):

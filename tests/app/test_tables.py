@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from failuretwin.app import terminal
-from failuretwin.app.terminal import Table, figures_table, progress_bar, show, tell
+from failuretwin.app.terminal import Table, elapsed, figures_table, progress_bar, show, tell
+from warm_command import remarks
 
 COUNTS = figures_table(("motor [counts]", "n"), [("a:smile: [b]", "1"), ("c", "20")], "counted")
 
@@ -64,6 +67,18 @@ def test_short_work_says_nothing(clock, capsys):
             clock[0] += 0.4
             advance(1)
     assert capsys.readouterr().err == ""
+
+
+def test_work_of_unknown_length_says_that_it_goes_on(monkeypatch, capsys):
+    monkeypatch.setattr(terminal, "REPORT_EVERY_S", 0.01)
+    told = ""
+    with elapsed("diagnosing"):
+        while told.count("\n") < 3:
+            told += capsys.readouterr().err
+    assert re.fullmatch(r"(diagnosing: 0 s so far\n)+", told)
+    assert remarks(told) == ""
+    with elapsed("diagnosing"):
+        pass
 
 
 def test_text_of_files_does_not_act_on_the_terminal(capsys):

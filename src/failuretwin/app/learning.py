@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from failuretwin.app.reports.calibration_report import taught_section, tracking_line
 from failuretwin.app.reports.technician_page import Section
-from failuretwin.app.terminal import progress_bar
+from failuretwin.app.terminal import elapsed, progress_bar
 from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
 from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser, learned_name
 from failuretwin.connection.tracked_diagnosis import (
@@ -118,7 +118,8 @@ def found_in(
         InputError: If the robot cannot be learned from what was seen.
     """
     if learns is None:
-        return Findings(diagnoser.diagnose(runs), bayes)
+        with elapsed("diagnosing"):
+            return Findings(diagnoser.diagnose(runs), bayes)
     check_learning_from(sensed)
     if isinstance(learns, Tracking):
         return learns.diagnose(runs)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -157,3 +158,29 @@ def _progress_lines(what: str, total: int) -> Progress:
             tell(f"{what}: {done} of {total}, about {left_s:.0f} s left", err=True)
 
     return advance
+
+
+@contextmanager
+def elapsed(what: str) -> Iterator[None]:
+    """Tell now and then that the block goes on: nobody knows how long it takes."""
+    if sys.stderr.isatty():
+        from rich.console import Console
+
+        with Console(stderr=True).status(what):
+            yield
+        return
+    over = threading.Event()
+
+    def tell_now_and_then() -> None:
+        seconds = 0.0
+        while not over.wait(REPORT_EVERY_S):
+            seconds += REPORT_EVERY_S
+            tell(f"{what}: {seconds:.0f} s so far", err=True)
+
+    telling = threading.Thread(target=tell_now_and_then, daemon=True)
+    telling.start()
+    try:
+        yield
+    finally:
+        over.set()
+        telling.join()

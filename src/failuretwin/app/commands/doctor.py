@@ -10,7 +10,7 @@ import click
 
 import failuretwin as ft
 from failuretwin.app.commands import options as opt
-from failuretwin.app.terminal import show, tell
+from failuretwin.app.terminal import elapsed, show, tell
 from failuretwin.core.errors import InputError, counted
 
 if TYPE_CHECKING:
@@ -48,10 +48,11 @@ def doctor(
     known = robot.known
     runs = reading.runs(robot.model)
     seen = ft.BayesDiagnoser(known.twin, known.imperfections).seen(runs)
-    set_ups = seen.set_ups()
-    unfit = _unfit(seen, set_ups)
-    undo = set_ups.best.set_up if set_ups.fits else None
-    frame = seen.under(set_ups.best.set_up.correction).frame() if undo and unfit else None
+    with elapsed("looking at set-ups"):
+        set_ups = seen.set_ups()
+        unfit = _unfit(seen, set_ups)
+        undo = set_ups.best.set_up if set_ups.fits else None
+        frame = seen.under(set_ups.best.set_up.correction).frame() if undo and unfit else None
     if undo and frame:
         unfit, undo = f"{unfit}: {frame.what}", frame.beside(undo)
     show(_set_up_line(set_ups, unfit), *_log_lines(seen, set_ups, bool(unfit)))
