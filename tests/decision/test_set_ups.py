@@ -242,7 +242,7 @@ def test_a_zero_far_off_what_such_robots_do_is_told_of_one_run(twin, armpi, know
     assert found.diagnosis == "healthy"
     assert len(told) == (off_rad > 0.0)
     for line in told:
-        assert re.match(r"motor 3 rests \+1[345] counts off", line)  # 0.06 rad is 14.3 counts
+        assert re.match(r"motor 3 rests \+3\.\d deg off", line)  # 0.06 rad is 3.4 deg
         assert line.endswith(FAULT_OF_EVERY_RUN)
     state = robot_state([found], armpi)
     assert (state.state.kind == HEALTHY_STATE) == (off_rad == 0.0)

@@ -113,7 +113,7 @@ def test_an_arm_that_obeys_nothing_is_not_healthy(twin, work, rng, noise_m):
 @pytest.mark.parametrize(
     ("wrong", "words", "movements"),
     [
-        (replace(NONE, z=np.deg2rad(6.0) * I4[2]), "motor 3 stands -2", 6),
+        (replace(NONE, z=np.deg2rad(6.0) * I4[2]), "motor 3 stands -6", 6),
         (replace(NONE, t=np.array([0.0, 0.0, 0.02])), "does not seem to stand where", 11),
     ],
 )
