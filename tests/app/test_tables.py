@@ -77,8 +77,6 @@ def test_work_of_unknown_length_says_that_it_goes_on(monkeypatch, capsys):
             told += capsys.readouterr().err
     assert re.fullmatch(r"(diagnosing: 0 s so far\n)+", told)
     assert remarks(told) == ""
-    with elapsed("diagnosing"):
-        pass
 
 
 def test_text_of_files_does_not_act_on_the_terminal(capsys):

@@ -246,6 +246,18 @@ def test_parts_of_other_motors_cannot_be_joined(runs):
         concatenate([runs, other])
 
 
+def test_gaps_that_are_filled_by_lines_stay_gaps_on_a_finer_grid():
+    time = np.arange(41) * 0.1
+    path = np.stack([np.interp(time, time[::5], one) for one in np.eye(9)[:3]], axis=-1)
+    filled = table(("c",), samples=41, measured=path[None], measured_rate_hz=2.0).to_dataset()
+    joined = concatenate([filled, table(("d",), samples=81, step=0.04).to_dataset()])
+    grid = joined["time"].values
+    inside = grid <= time[-1]
+    for axis in range(3):
+        expected = np.interp(grid[inside], time, path[:, axis])
+        assert joined["measured"].values[0, inside, axis] == pytest.approx(expected)
+
+
 @pytest.mark.parametrize("step", [0.2, 0.13])
 def test_parts_are_put_on_the_finest_grid(runs, step):
     rng = np.random.default_rng(0)

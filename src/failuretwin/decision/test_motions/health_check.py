@@ -269,8 +269,8 @@ class Checking:
             on_progress: Called with the number of further faults, of all in `asked`.
         """
         known, priors = self.known, checking(self.model, self.asked)
-        what = self.asked, priors, 0.0, on_progress
-        return isolability(known.twin, command, time, known.imperfections, *what)
+        about = known.twin, command, time, known.imperfections, self.asked, priors
+        return isolability(*about, on_progress=on_progress)
 
     def isolability_of(self, motions: Motions, on_progress: Progress = unseen) -> IsolabilityReport:
         """Return the isolability of designed motions."""
