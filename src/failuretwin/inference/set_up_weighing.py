@@ -60,9 +60,11 @@ beside a fault is not what movements agree on."""
 BESIDE_RAD = tuple(np.deg2rad([2.0, 1.0]).tolist())
 """Steps by which a zero is looked for beside a sensor that stands elsewhere."""
 HOPELESS_NATS = 12.0
-"""A zero that is so much less probable than the set-up as told is not looked at more closely."""
-ROUNDS = 2
-"""Newton steps to the zero that explains the runs best."""
+"""A zero that is so much less probable than the best of all motors, or the set-up as told, is not
+looked at more closely."""
+ROUNDS, NEARLY = 2, 0.3
+"""Newton steps to the zero that explains the runs best, at most, and by how many of its deviations
+the last one moved it."""
 CHUNK_RUNS = 64
 """Runs that are weighed at a time, whatever the set-up."""
 
@@ -265,24 +267,39 @@ class SetUpWeighing:
             told: Log of prior times evidence of the set-up as told.
             also: Zeros that are tried beside those that movements agree on [rad].
         """
-        likelihood, robot = self.behind([first]), self.robot
-        least = AGREEING * likelihood.usable.sum()
+        likelihood = self.behind([first])
+        motors = np.flatnonzero(~self.robot.slides).tolist()
+        tried = {k: self._likeliest_zero(likelihood, first, k, also) for k in motors}
+        best = max([told, *(height for _, height in tried.values())])
         found = []
-        for k in np.flatnonzero(~robot.slides).tolist():
-            width = float(likelihood.model.least_visible[k])
-            says = likelihood.profile(k)
-            seen = likelihood.usable & (says.min_distance2[..., 0] < EXPLAINED)
-            away = says.turned(says.mode - says.expected)[..., 0]
-            values = [*_agreed(away[seen], width, least), *also]
-            values = [z for z in values if not right_in_some(away, seen, z, width)]
-            tried = self.weigh([self._off(first, k, value) for value in values])
-            log_joint = [one.log_joint for one in tried]
-            if max(log_joint, default=-np.inf) > told - HOPELESS_NATS:
-                likeliest = values[int(np.argmax(log_joint))]
+        for k, (likeliest, height) in tried.items():
+            if height > best - HOPELESS_NATS:
+                width = float(likelihood.model.least_visible[k])
                 zero = self._zero(first, k, likeliest, width)
                 off = zero.set_up.correction.z[k] - first.correction.z[k]
                 found += [zero] if abs(off) > OFF * width else []
         return found
+
+    def _likeliest_zero(
+        self, likelihood: RunLikelihood, first: SetUp, motor: int, also: Sequence[float]
+    ) -> tuple[float, float]:
+        """Return the zero of a motor that explains the runs best, and log of prior times evidence.
+
+        Args:
+            likelihood: The runs behind the mistake.
+            first: The mistake.
+            motor: Index of the motor.
+            also: Zeros that are tried beside those that movements agree on [rad].
+        """
+        width, least = float(likelihood.model.least_visible[motor]), likelihood.usable.sum()
+        says = likelihood.profile(motor)
+        seen = likelihood.usable & (says.min_distance2[..., 0] < EXPLAINED)
+        away = says.turned(says.mode - says.expected)[..., 0]
+        values = [*_agreed(away[seen], width, AGREEING * least), *also]
+        values = [z for z in values if not right_in_some(away, seen, z, width)]
+        tried = self.weigh([self._off(first, motor, value) for value in values])
+        heights = [(value, one.log_joint) for value, one in zip(values, tried, strict=True)]
+        return max(heights, key=lambda pair: pair[1], default=(0.0, -np.inf))
 
     def others(self, zeros: Sequence[WeighedSetUp]) -> list[WeighedSetUp]:
         """Return other robots than the calibrated one, set up as told, that explain as much.
@@ -343,8 +360,11 @@ class SetUpWeighing:
                 )
             )
             curvature = max((2.0 * middle - low - high) / width**2, 0.1 / width**2)
-            zero += float(np.clip((high - low) / (2.0 * width * curvature), -width, width))
+            step = float(np.clip((high - low) / (2.0 * width * curvature), -width, width))
+            zero += step
             width = float(np.clip(curvature**-0.5, 0.1 * width, width))
+            if abs(step) < NEARLY * width:
+                break
         best = self.weigh([self._off(first, motor, zero)])[0]
         volume = 0.5 * float(np.log(2.0 * np.pi / curvature))
         known = replace(best.set_up, log_prior=best.set_up.log_prior + volume)

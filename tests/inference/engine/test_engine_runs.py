@@ -216,7 +216,7 @@ def test_errors_far_below_the_largest_have_nodes(misbuilt):
     scene = Scene.of(model, moments_of(model, seen.settled), ft.Priors(), layout, V)
     mode = MODES["steady_state_error"]
     low, high = ft.Priors().sizes_of(mode, model, 0).ends
-    nodes = np.unique(np.abs(redrawn_rows(scene, 0, mode).drawn.size))
+    nodes = np.unique(np.abs(redrawn_rows(scene, 0, mode, all_along=True).drawn.size))
     nodes = nodes[nodes > 0.0]  # neither what has no size nor what is beside a loss
     assert high > 200.0 * low
     assert nodes.min() < 1.2 * low

@@ -49,27 +49,29 @@ def offset_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
     return moving.rows(*best, log_prior, size_prior(sizes, mode.signed), sampled(onsets, shares))
 
 
-def constant_rows(scene: Scene, motor: int, sizes: SizePrior, early: float) -> Rows:
-    """Return the rows of an error of either sign that begins in the run and stays as it is.
-
-    One that was there before is nothing but another zero of its motor.
+def constant_rows(
+    scene: Scene, motor: int, sizes: SizePrior, early: float, first: IntArray
+) -> Rows:
+    """Return the rows of an error of either sign that stays as it is.
 
     Args:
         scene: The runs.
         motor: Index of the motor.
         sizes: Sizes of the error [rad].
         early: Probability that it was there before the run.
+        first: The first moment that each row affects, (row,): the first of all, or others.
     """
     moments, intervals = scene.moments, moment_intervals(scene)
+    done = np.ones_like(moments.done) if first[0] == 0 else moments.done
 
     def angle(x: FloatArray, outcome: IntArray) -> FloatArray:
         settled = taken(scene.pose, outcome)[..., motor, None]
-        return settled + x[:, :, None] * moments.done[:, None, :, motor, None]
+        return settled + x[:, :, None] * done[:, None, :, motor, None]
 
-    moving = MovedMotor(scene, motor, False, angle, np.arange(1, moments.count))
+    moving = MovedMotor(scene, motor, False, angle, first)
     onset, share = intervals.samples(early)
-    onsets = sampled(onset[:, 1:], share[:, 1:])
-    log_prior = log_of(intervals.weights(early)[:, 1:])
+    onsets = sampled(onset[:, first], share[:, first])
+    log_prior = log_of(intervals.weights(early)[:, first])
     best = best_sizes(moving, sizes, signed=True, alike=True)
     return moving.rows(*best, log_prior, size_prior(sizes, signed=True), onsets)
 

@@ -2,8 +2,8 @@
 
 The outcomes of a moment are nodes over the size with both signs, each widened by half the distance
 to the next; beside a lost command of another motor the error counts as normal. Each range of sizes
-is a row, and each later onset one with any range. On a curve, which is one movement, an error that
-begins there may also stay as it is: rows of its size.
+is a row, and each later onset one with any range. An error from before the run may also be the same
+all along, and one that begins on a curve, which is one movement, stay as it is: rows of its size.
 
 Section: docs/inference.md#hypotheses
 """
@@ -26,13 +26,24 @@ NODES, DECADE = 16, 8
 """Nodes of the size on each side of zero, in a constant ratio: at least, and in a factor of 10."""
 CONSTANT = 0.5
 """Share of the errors that begin on a curve and then stay as they are; assumed."""
+ALL_ALONG, ODD_ZERO = 0.2, 2.0
+"""Share of the errors from before the run that are the same all along, and by how many deviations
+of the zero of a motor they are off at least: a smaller one is another zero; assumed."""
 SMALLEST = 1e-2
 """Smallest node, as a share of the largest size, where sizes begin at nothing, or at what shows
 only once the noise of the sensor is found."""
 
 
-def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
-    """Return the rows of a motor whose error is drawn anew for each movement."""
+def redrawn_rows(scene: Scene, motor: int, mode: FaultMode, all_along: bool) -> Rows:
+    """Return the rows of a motor whose error is drawn anew for each movement.
+
+    Args:
+        scene: The runs.
+        motor: Index of the motor.
+        mode: Its mode.
+        all_along: Whether an error that is there all along counts; false where a hypothesis of its
+            own says so. It never does at rest where the sizes of errors are told.
+    """
     moments, model = scene.moments, scene.model
     sizes = scene.priors.sizes_of(mode, model, motor)
     low, high = sizes.ends
@@ -86,13 +97,20 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
         ),
         onsets=sampled(samples[:, first], share[:, first]),
     )
-    curved = moments.on_curves.any(axis=1)
-    if not curved.any():
-        return redrawn
-    stays = np.where(curved, CONSTANT, 0.0)[:, None]
-    log_prior[:, len(shares) :] += log_of(1.0 - stays)
-    constant = constant_rows(scene, motor, sizes, early)
-    return redrawn.beside(replace(constant, log_prior=constant.log_prior + log_of(stays)))
+    stays = np.zeros((runs, count))
+    stays[moments.on_curves.any(axis=1), 1:] = CONSTANT
+    stays[:, 0] = ALL_ALONG * (all_along and (scene.layout.moving or sizes.visible))
+    log_prior += log_of(1.0 - stays[:, first])
+    parts = [
+        (sizes.above(ODD_ZERO * scene.zeros[motor]), np.arange(1)),
+        (sizes, np.arange(1, count)),
+    ]
+    for some, begins in parts:
+        if stays[:, begins].any():
+            constant = constant_rows(scene, motor, some, early, begins)
+            log_stays = log_of(stays[:, begins])
+            redrawn = redrawn.beside(replace(constant, log_prior=constant.log_prior + log_stays))
+    return redrawn
 
 
 def _mass(edge: FloatArray, low: float, high: float) -> FloatArray:

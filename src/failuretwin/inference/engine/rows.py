@@ -142,15 +142,23 @@ class _Both:
         self, run: IntArray, row: IntArray, moment: IntArray, outcome: IntArray
     ) -> FloatArray:
         """Return G; see `ColumnsOf`."""
-        found, theirs = self.rows.columns_of(run, row, moment, outcome), row >= self._count
-        at = run[theirs], row[theirs] - self._count, moment[theirs], outcome[theirs]
-        found[theirs] = self.other.columns_of(*at)
+        found, theirs = None, row >= self._count
+        for mask, rows, begin in ((~theirs, self.rows, 0), (theirs, self.other, self._count)):
+            at = run[mask], row[mask] - begin, moment[mask], outcome[mask]
+            some = rows.columns_of(*at)
+            if found is None:
+                found = np.empty((*row.shape, *some.shape[1:]))
+            found[mask] = some
+        assert found is not None
         return found
 
     def amount_prior(self, x: FloatArray, run: IntArray, row: IntArray) -> FloatArray:
-        """Return the log density of amounts, which the rows behind have; see `AmountPrior`."""
-        assert self.other.amount_prior is not None
-        return self.other.amount_prior(x, run, row - self._count)
+        """Return the log density of amounts, of rows that have some; see `AmountPrior`."""
+        found, theirs = np.zeros(x.shape), row >= self._count
+        for mask, rows, begin in ((~theirs, self.rows, 0), (theirs, self.other, self._count)):
+            if rows.amount_prior is not None:
+                found[mask] = rows.amount_prior(x[mask], run[mask], row[mask] - begin)
+        return found
 
     def onsets(self, run: int, row: int, amount: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return samples of the onset; see `Onsets`."""
@@ -171,6 +179,7 @@ class Scene:
         layout: Places in theta.
         columns: G of a healthy robot under each outcome, (run, moment, outcome, channel, theta).
         spread: G V G^T where every command arrives, (run, moment, channel, channel) [m2].
+        zeros: Deviation of the zero of each motor, of bias and joint frame, (motor,) [rad].
         pose: Settled angles under each outcome, (run, moment, outcome, motor) [rad].
         shown: What the sensors show of these, (run, moment, outcome, ...).
         healthy: Outcomes of a healthy robot, (run, moment, outcome, ...).
@@ -183,6 +192,7 @@ class Scene:
     layout: Layout
     columns: FloatArray
     spread: FloatArray
+    zeros: FloatArray
     pose: FloatArray
     shown: Shown
     healthy: Outcomes
@@ -214,7 +224,8 @@ class Scene:
         spread = usual @ covariance @ np.swapaxes(usual, -1, -2)
         beside = moments.late, moments.bent
         healthy = Outcomes.of_poses(moments, shown, model.scatter**2, *beside)
-        return cls(model, moments, priors, noise, layout, G, spread, pose, shown, healthy)
+        zeros = layout.zeros(covariance)
+        return cls(model, moments, priors, noise, layout, G, spread, zeros, pose, shown, healthy)
 
     def columns_of(
         self, run: IntArray, row: IntArray, moment: IntArray, outcome: IntArray

@@ -17,10 +17,11 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
+from failuretwin.failure_behavior.modes import EncoderBias
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.filter import RowsPosterior
 from failuretwin.inference.engine.healthy_rows import healthy_rows
@@ -106,8 +107,8 @@ def has_rows(hypothesis: Hypothesis, moving: bool = False) -> bool:
     return Signature.MISSED not in signatures and (moving or Signature.TRANSIENT not in signatures)
 
 
-def rows_of(scene: Scene, hypothesis: Hypothesis) -> Rows:
-    """Return the rows of a hypothesis that has some."""
+def rows_of(scene: Scene, hypothesis: Hypothesis, hypotheses: Sequence[Hypothesis]) -> Rows:
+    """Return the rows of a hypothesis that has some, beside others."""
     if hypothesis.is_healthy:
         return healthy_rows(scene)
     fault = hypothesis.faults[0]
@@ -115,11 +116,16 @@ def rows_of(scene: Scene, hypothesis: Hypothesis) -> Rows:
     if mode.signature is Signature.HELD:
         return held_rows(scene, motor)
     if mode.signature is Signature.REDRAWN_OFFSET:
-        return redrawn_rows(scene, motor, mode)
+        return redrawn_rows(scene, motor, mode, _zero_of(fault.motor) not in hypotheses)
     winds = mode.signature is Signature.OFFSET and mode.hysteresis and scene.layout.moving
     if winds or mode.signature is Signature.TRANSIENT:
         return way_rows(scene, motor, mode)
     return offset_rows(scene, motor, mode)
+
+
+def _zero_of(motor: str) -> Hypothesis:
+    """Return the hypothesis that the zero of a motor is off."""
+    return Hypothesis((Fault(motor, EncoderBias.mode),))
 
 
 @dataclass(frozen=True)
@@ -143,7 +149,7 @@ class RunsEvidence:
     @cached_property
     def rows(self) -> list[Rows]:
         """Rows of each hypothesis."""
-        return [rows_of(self.scene, hypothesis) for hypothesis in self.hypotheses]
+        return [rows_of(self.scene, one, self.hypotheses) for one in self.hypotheses]
 
     @cached_property
     def prepared(self) -> list[Prepared]:

@@ -89,6 +89,16 @@ class Layout:
         lags = (at >= self.lags.start) & (at < self.lags.stop)
         return np.where((at < self.offsets.stop) | lags, theta, 0.0)
 
+    def zeros(self, covariance: FloatArray) -> FloatArray:
+        """Return the deviation of the zero of each motor, of bias and joint frame, (motor,) [rad].
+
+        Args:
+            covariance: V, (theta, theta).
+        """
+        variance = np.diag(covariance)
+        turned = variance[self.frames].reshape(-1, 2, 3)[:, 1].max(axis=1) if self.geometry else 0.0
+        return np.asarray(np.sqrt(variance[self.offsets][: self.motors] + turned))
+
     def own(self, motor: int) -> list[int]:
         """Return the places of one motor's bias, compliance and friction."""
         return [REGISTRATION + motor + self.motors * k for k in range(3)]

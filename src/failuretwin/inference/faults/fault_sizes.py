@@ -14,7 +14,7 @@ Section: docs/inference.md#hypotheses
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,6 +57,13 @@ class SizePrior:
     def even(cls, ranges: Sequence[Range]) -> SizePrior:
         """Return the prior of ranges that are equally likely."""
         return cls(tuple(ranges), (1.0 / len(ranges),) * len(ranges))
+
+    def above(self, least: float) -> SizePrior:
+        """Return the ranges that begin at a size or more, at least the last one."""
+        kept = [i for i, (low, _) in enumerate(self.ranges) if low >= least] or [-1]
+        total = sum(self.shares[i] for i in kept)
+        ranges = tuple(self.ranges[i] for i in kept)
+        return replace(self, ranges=ranges, shares=tuple(self.shares[i] / total for i in kept))
 
     @property
     def log_share(self) -> FloatArray:

@@ -1,10 +1,12 @@
 """How far a moving tool trails its commands beside what is usual, before anything else is judged.
 
-    shift = argmax of  log p(shift) + 0.3 sum over k of log t_4(x_k - y(q(t_k - lag - shift)))
+    shift = argmax of  log p(shift) + log sum over j of p(j) integral p(b)
+                       prod over k of t_4(x_k - y(q(t_k - lag - shift)) - J_j b)^0.3 db
 
 The engine is linear in the lag of each motor, which holds for some hundredths of a second. Clocks
 are further apart, and so are robots that nobody has calibrated: readings on the way are compared
-with the command at the likeliest lag. A faulty motor leaves outliers at every shift.
+with the command at the likeliest lag. No motor j or one may be off by b all along; other faults
+leave outliers at every shift.
 
 Section: docs/inference.md#moments
 """
@@ -15,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.core.numerics import log_fall
+from failuretwin.core.numerics import log_fall, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -28,6 +30,9 @@ TAIL_DOF = 4.0
 """Degrees of freedom of what a reading is off by."""
 TEMPER, READINGS = 0.3, 60
 """What a reading counts, since neighbours err together, and how many of a run are looked at."""
+OFF_RATE, OFF_RAD, OFF_ROUNDS = 0.1, 0.3, 4
+"""Share of runs in which a motor is off all along, which looks like a lag while motors go one way,
+and its deviation [rad]; assumed. Rounds of reweighted least squares to find by how much."""
 GAIN_NATS = 3.0
 """By how much a shift explains the readings better than none where it counts."""
 RUNS = 32
@@ -83,9 +88,11 @@ class _Way:
         dims = expected.shape[-1]
         scale = moved / dims + model.path_noise**2
         point = self.evidence.readings.point[run][seen][:, None]
-        square = np.sum((point - expected) ** 2, axis=-1) / scale
-        density = log_fall(square, TAIL_DOF, dims) - 0.5 * dims * np.log(scale)
-        return np.asarray(TEMPER * density.sum(axis=0))
+        fits = _Fit(point - expected, scale)
+        none = np.log1p(-OFF_RATE) + fits.log_density(np.zeros(expected.shape))
+        off = [fits.log_off(jacobian[..., k]) for k in range(jacobian.shape[-1])]
+        rate = np.log(OFF_RATE / len(off))
+        return np.asarray(log_sum(np.stack([none, *(rate + one for one in off)]), axis=0))
 
     def _looked_at(self, run: int) -> IntArray:
         """Return readings while motors are told to move, evenly spread."""
@@ -97,6 +104,44 @@ class _Way:
         seen = np.flatnonzero(evidence.read[run] & moves)
         count = min(len(seen), READINGS)
         return seen[np.unique(np.linspace(0, len(seen) - 1, count).astype(np.int64))]
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Residuals of readings at some shifts, explained by a motor that is off or by none.
+
+    Attributes:
+        residual: (reading, shift, channel) [m].
+        scale: Variance of each channel, (reading, shift) [m2].
+    """
+
+    residual: FloatArray
+    scale: FloatArray
+
+    def log_density(self, explained: FloatArray) -> FloatArray:
+        """Return the log density of the readings less what explains them, (shift,)."""
+        square, dims = self._square(explained), self.residual.shape[-1]
+        density = log_fall(square, TAIL_DOF, dims) - 0.5 * dims * np.log(self.scale)
+        return np.asarray(TEMPER * density.sum(axis=0))
+
+    def log_off(self, lever: FloatArray) -> FloatArray:
+        """Return the log density where one motor is off by b ~ N(0, OFF_RAD^2), (shift,).
+
+        Args:
+            lever: What the sensors show of b, (reading, shift, channel) [m/rad].
+        """
+        dims, off = self.residual.shape[-1], np.zeros(self.scale.shape[1])
+        for _ in range(OFF_ROUNDS):
+            square = self._square(lever * off[:, None])
+            weight = TEMPER * (TAIL_DOF + dims) / (TAIL_DOF + square) / self.scale
+            force = np.sum(weight * np.sum(lever * self.residual, axis=-1), axis=0)
+            precision = np.sum(weight * np.sum(lever**2, axis=-1), axis=0)
+            off = force / (precision + OFF_RAD**-2)
+        prior = -0.5 * (off / OFF_RAD) ** 2 - 0.5 * np.log1p(precision * OFF_RAD**2)
+        return self.log_density(lever * off[:, None]) + prior
+
+    def _square(self, explained: FloatArray) -> FloatArray:
+        return np.asarray(np.sum((self.residual - explained) ** 2, axis=-1) / self.scale)
 
 
 def command_at(evidence: Evidence, run: int, when: FloatArray) -> FloatArray:
