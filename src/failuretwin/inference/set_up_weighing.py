@@ -63,8 +63,8 @@ HOPELESS_NATS = 12.0
 """A zero that is so much less probable than the best of all motors, or the set-up as told, is not
 looked at more closely."""
 ROUNDS, NEARLY = 2, 0.3
-"""Newton steps to the zero that explains the runs best, at most, and by how many of its deviations
-the last one moved it."""
+"""Newton steps to the zero that explains the runs best, at most, and how many of its deviations are
+no step."""
 CHUNK_RUNS = 64
 """Runs that are weighed at a time, whatever the set-up."""
 
@@ -353,19 +353,17 @@ class SetUpWeighing:
     def _zero(self, first: SetUp, motor: int, zero: float, width: float) -> WeighedSetUp:
         """Return what the runs say of a zero near some value, the value integrated out."""
         for _ in range(ROUNDS):
-            low, middle, high = (
-                float(one.log_evidence.sum())
-                for one in self.weigh(
-                    [self._off(first, motor, zero + width * step) for step in (-1.0, 0.0, 1.0)]
-                )
-            )
+            around = [self._off(first, motor, zero + width * step) for step in (-1.0, 0.0, 1.0)]
+            tried = self.weigh(around)
+            low, middle, high = (float(one.log_evidence.sum()) for one in tried)
             curvature = max((2.0 * middle - low - high) / width**2, 0.1 / width**2)
             step = float(np.clip((high - low) / (2.0 * width * curvature), -width, width))
-            zero += step
-            width = float(np.clip(curvature**-0.5, 0.1 * width, width))
+            best, width = tried[1], float(np.clip(curvature**-0.5, 0.1 * width, width))
             if abs(step) < NEARLY * width:
                 break
-        best = self.weigh([self._off(first, motor, zero)])[0]
+            zero += step
+        else:
+            best = self.weigh([self._off(first, motor, zero)])[0]
         volume = 0.5 * float(np.log(2.0 * np.pi / curvature))
         known = replace(best.set_up, log_prior=best.set_up.log_prior + volume)
         return replace(best, set_up=known)
