@@ -42,7 +42,7 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode, all_along: bool) -> 
         motor: Index of the motor.
         mode: Its mode.
         all_along: Whether an error that is there all along counts; false where a hypothesis of its
-            own says so. It never does at rest where the sizes of errors are told.
+            own says so. It never does where somebody says how large errors are: they are drawn.
     """
     moments, model = scene.moments, scene.model
     sizes = scene.priors.sizes_of(mode, model, motor)
@@ -99,7 +99,7 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode, all_along: bool) -> 
     )
     stays = np.zeros((runs, count))
     stays[moments.on_curves.any(axis=1), 1:] = CONSTANT
-    stays[:, 0] = ALL_ALONG * (all_along and (scene.layout.moving or sizes.visible))
+    stays[:, 0] = ALL_ALONG * (all_along and sizes.visible)
     log_prior += log_of(1.0 - stays[:, first])
     parts = [
         (sizes.above(ODD_ZERO * scene.zeros[motor]), np.arange(1)),
