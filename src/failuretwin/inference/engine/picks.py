@@ -46,16 +46,12 @@ class Picks:
         names = [field.name for field in fields(cls)]
         return cls(*(np.concatenate([getattr(one, n) for one in parts]) for n in names))
 
-    def row_of(self, array: FloatArray) -> IntArray:
-        """Return the index along the axis of rows, which may be common to all."""
-        return self.row if array.shape[1] > 1 else np.zeros_like(self.row)
-
 
 @dataclass(frozen=True)
 class Prepared:
     """Rows of a hypothesis with what does not depend on scatter and noise.
 
-    A place is a row of a run, or a run where all of its rows share their outcomes.
+    A place is a row of a run, or several that share their outcomes.
 
     Attributes:
         tables: What rows say, of one normal distribution of theta or of each.
@@ -83,10 +79,10 @@ def prepared(scene: Scene, rows: Rows, components: Components) -> Prepared:
         components: What is believed of the robot.
     """
     runs, count = rows.log_prior.shape
-    own = rows.outcomes.residual.shape[1]  # rows with outcomes of their own, or 1
+    own = rows.outcomes.residual.shape[1]  # tables of outcomes, which rows may share
     assert rows.columns.shape[1] == own, "rows share outcomes and columns, or neither"
     every = np.arange(runs * count).reshape(runs, count)
-    place = every if own == count else np.repeat(np.arange(runs)[:, None], count, axis=1)
+    place = own * np.arange(runs)[:, None] + rows.table
 
     def flat(array: FloatArray) -> FloatArray:
         return array.reshape(runs * own, *array.shape[2:])
@@ -349,7 +345,7 @@ def narrowed(
     moment = np.arange(share.shape[1])[None, :, None]
     some = run[:, None, None]
     G = rows.columns_of(*np.broadcast_arrays(some, row[:, None, None], moment, rows.usual[kept]))
-    index = some, picks.row_of(rows.outcomes.residual)[:, None, None], moment, kept
+    index = some, rows.table[row][:, None, None], moment, kept
     outcomes = Outcomes(*(x[index] for x in rows.outcomes.arrays))
     log_weight = rows.log_weight[some, row[:, None, None], moment, kept]
     own_count = np.arange(kept.shape[-1]) < count[..., None]  # whatever its neighbours need

@@ -54,10 +54,10 @@ class Rows:
     Attributes:
         log_prior: Log probability of each row given its hypothesis, (run, row).
         first: First moment that the fault affects, (row,).
-        outcomes: Outcomes, (run, row or 1, moment, outcome, ...).
+        outcomes: Outcomes, (run, table, moment, outcome, ...); rows may share a table.
         log_weight: Their log probability, (run, row, moment, outcome).
         usual: Outcome of the healthy robot whose columns an outcome has, (outcome,).
-        columns: G where every command arrives, (run, row or 1, moment, channel, theta).
+        columns: G where every command arrives, (run, table, moment, channel, theta).
         columns_of: G of other usual outcomes too: there are too many to keep those of all.
         lever: H, (run, row, moment, channel).
         centre: Amount at z = 0, (run, row).
@@ -68,6 +68,8 @@ class Rows:
         tie: What theta adds to the amount, so that the amount itself is less in doubt,
             (run, row, theta); None: nothing.
         own: Places in theta that say nothing any more from the onset on.
+        shared: Index of each row along the axis of outcomes and columns, (row,); None: each has its
+            own, or all have the same.
     """
 
     log_prior: FloatArray
@@ -85,6 +87,14 @@ class Rows:
     onsets: Onsets | None = None
     tie: FloatArray | None = None
     own: Sequence[int] = ()
+    shared: IntArray | None = None
+
+    @property
+    def table(self) -> IntArray:
+        """Index of each row along the axis of outcomes and columns, (row,)."""
+        if self.shared is not None:
+            return self.shared
+        return np.minimum(np.arange(len(self.first)), self.columns.shape[1] - 1)
 
     def beside(self, other: Rows) -> Rows:
         """Return these rows and others of the same hypothesis behind them.
@@ -95,21 +105,22 @@ class Rows:
         both = _Both(self, other)
         more = self.log_weight.shape[-1] - other.log_weight.shape[-1]
         pairs = zip(self.outcomes.arrays, other.outcomes.arrays, strict=True)
-        padded = _padded(other.log_weight, more, -np.inf)
+        padded, own = _padded(other.log_weight, more, -np.inf), self.columns.shape[1]
         return replace(
             self,
-            log_prior=both.joined(self.log_prior, other.log_prior),
+            log_prior=_joined(self.log_prior, other.log_prior),
             first=np.concatenate([self.first, other.first]),
-            outcomes=Outcomes(*(both.joined(a, _padded(b, more)) for a, b in pairs)),
-            log_weight=both.joined(self.log_weight, padded),
-            columns=both.joined(self.columns, other.columns),
+            outcomes=Outcomes(*(_joined(a, _padded(b, more)) for a, b in pairs)),
+            log_weight=_joined(self.log_weight, padded),
+            columns=_joined(self.columns, other.columns),
             columns_of=both.columns_of,
-            lever=both.joined(self.lever, other.lever),
-            centre=both.joined(self.centre, other.centre),
-            variance=both.joined(self.variance, other.variance),
+            lever=_joined(self.lever, other.lever),
+            centre=_joined(self.centre, other.centre),
+            variance=_joined(self.variance, other.variance),
             amount_prior=both.amount_prior,
             drawn=both.drawn,
             onsets=both.onsets,
+            shared=np.concatenate([self.table, own + other.table]),
         )
 
 
@@ -123,11 +134,6 @@ class _Both:
     @property
     def _count(self) -> int:
         return self.rows.log_prior.shape[1]
-
-    def joined(self, own: FloatArray, others: FloatArray) -> FloatArray:
-        """Return values of both, (run, row, ...); those of the first may be common to all rows."""
-        wide = np.broadcast_to(own, (len(own), self._count, *own.shape[2:]))
-        return np.concatenate([wide, others], axis=1)
 
     @property
     def drawn(self) -> Drawn | None:
@@ -251,6 +257,11 @@ class Scene:
     def settled(self) -> FloatArray:
         """Settled angles where every command arrives, (run, moment, motor) [rad]."""
         return self.pose[:, :, 0]
+
+
+def _joined(own: FloatArray, others: FloatArray) -> FloatArray:
+    """Return values (run, row, ...) of some rows and of others behind them."""
+    return np.concatenate([own, others], axis=1)
 
 
 def _padded(array: FloatArray, more: int, value: float = 0.0) -> FloatArray:
