@@ -210,6 +210,9 @@ def test_what_every_run_has_is_set_up_and_what_one_has_is_a_fault(twin, armpi, k
     right = diagnoser.diagnose(runs)
     assert [d.diagnosis for d in every] == [d.diagnosis for d in right]
     assert sum(d.diagnosis == "healthy" for d in every) > 5
+    for told in (d for d in every if d.diagnosis == "healthy"):  # no verdict without its condition
+        assert re.search(r"; but the log does not fit the profile: motor 3 stands \+", told.verdict)
+    assert not any("does not fit" in d.verdict for d in right)
     one = runs.copy(deep=True)
     one["command"].values[0] = zero.runs(runs)["command"].values[0]
     found = diagnoser.diagnose(one)

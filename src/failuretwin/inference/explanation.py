@@ -32,7 +32,7 @@ from failuretwin.inference.advice import (
     rests_on_one_movement,
 )
 from failuretwin.inference.observation.between_commands import TOO_SELDOM
-from failuretwin.inference.set_ups.wrong_setup import DOUBTS, NOWHERE
+from failuretwin.inference.set_ups.wrong_setup import DOUBTS, MISFITS, NOWHERE, undone
 
 TELLING_NATS = 1.0
 """Evidence of a movement worth telling [nats]: it changes the odds by a factor of 2.7."""
@@ -129,6 +129,8 @@ def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:
     if len(possible) > 1:
         others = [f"{plain_name(h)} {percent(diagnosis.posterior[str(h)])}" for h in possible[1:3]]
         text += f" (or {', '.join(others)})"
+    if best.is_healthy and (wrong := undone(diagnosis.quality)):
+        text += f"; but {MISFITS}: {wrong}"
     return f"{text}{LAST_ONLY}" if _shows_last(diagnosis, best) else text
 
 

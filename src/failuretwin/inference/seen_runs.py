@@ -51,7 +51,7 @@ from failuretwin.inference.set_ups.set_ups import (
     shifted,
     turned,
 )
-from failuretwin.inference.set_ups.wrong_setup import ANOTHER, MAY_MISFIT, MISFITS
+from failuretwin.inference.set_ups.wrong_setup import ANOTHER, MAY_MISFIT, MISFITS, UNDONE
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -311,7 +311,7 @@ def common_remarks(set_ups: SetUpPosterior, rounding: Sequence[str]) -> list[str
     """Return what is to be said of the log of all runs, of its set-up first."""
     remark = set_up_remark(set_ups)
     if set_ups.fits and set_ups.wrong >= SURE:
-        remark = f"{remark}; judged with that undone"
+        remark += UNDONE
     return [line for line in (remark, *rounding) if line]
 
 

@@ -43,8 +43,8 @@ FEW = 8
 FINALISTS = 2
 """Mistakes that are looked at with a sensor that may stand a little elsewhere too."""
 NEAR, PROMISING = 0.15, 8
-"""Of two mistakes at once so many are weighed: those that bring most movements nearest, within this
-share of the reach."""
+"""Of single mistakes, of two at once and of the zeros of a motor so many are weighed: those that
+bring most movements nearest, within this share of the reach."""
 FAR = 0.08
 """A frame that moves the tool by less than this share of the reach is a matter of registration."""
 CHOICE_NATS = 12.0
@@ -209,7 +209,7 @@ class SetUpWeighing:
         single = self.options(self.as_told)
         told = self.weigh([self.as_told], everything=True)[0]
         zeros = self.zeros(self.as_told, told.log_joint, ZEROS_RAD)
-        found = [told, *self.weigh(single), *zeros, *self.others(zeros)]
+        found = [told, *self.weigh(self.nearest(single)), *zeros, *self.others(zeros)]
         likeliest = max(zeros, key=lambda one: one.log_joint, default=None)
         if likeliest is not None:
             found += self.zeros(likeliest.set_up, likeliest.log_joint, ZEROS_RAD)
@@ -297,9 +297,12 @@ class SetUpWeighing:
         away = says.turned(says.mode - says.expected)[..., 0]
         values = [*_agreed(away[seen], width, AGREEING * least), *also]
         values = [z for z in values if not right_in_some(away, seen, z, width)]
-        tried = self.weigh([self._off(first, motor, value) for value in values])
-        heights = [(value, one.log_joint) for value, one in zip(values, tried, strict=True)]
-        return max(heights, key=lambda pair: pair[1], default=(0.0, -np.inf))
+        if not values:
+            return 0.0, -np.inf
+        tried = self.weigh(self.nearest([self._off(first, motor, value) for value in values]))
+        best = max(tried, key=lambda one: one.log_joint)
+        off = best.set_up.correction.z[motor] - first.correction.z[motor]
+        return float(off), best.log_joint
 
     def others(self, zeros: Sequence[WeighedSetUp]) -> list[WeighedSetUp]:
         """Return other robots than the calibrated one, set up as told, that explain as much.

@@ -215,6 +215,14 @@ def test_a_motor_that_follows_later_is_found_and_timed():
     assert str(again.diagnosis) == "motor_2:lag"  # not taken for one that sticks now and then
 
 
+def test_movements_of_a_curve_do_not_speak_for_what_does_not_show_on_it():
+    """A motor that stands now and then misses no movement: a curve is one."""
+    told = ["healthy", "motor_2:intermittent"]
+    (found,) = ft.diagnose(late_run(curve(), 0.0), ROBOT, "generic", hypotheses=told)
+    assert found.evidence
+    assert all(one.nats == 0.0 for one in found.evidence)
+
+
 @pytest.mark.parametrize("sensing", ["encoders", "tool+encoders"])
 def test_encoders_are_read_on_the_way(sensing):
     command, time = curve(), STEP_S * np.arange(len(curve()))

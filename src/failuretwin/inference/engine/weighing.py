@@ -228,10 +228,12 @@ class Weighing:
         total = self.by_hypothesis
         says = engine_likelihoods(self.evidence)
         found = dict(zip(self.with_rows.tolist(), says, strict=True))
-        return [
-            replace(self._with_way(h, found.get(h)), log_evidence=total[:, h])
-            for h in range(len(self.hypotheses))
-        ]
+        weighed = [self._with_way(h, found.get(h)) for h in range(len(self.hypotheses))]
+        curved = self.evidence.scene.moments.on_curves.any(axis=1)
+        for healthy in np.flatnonzero([h.is_healthy for h in self.hypotheses]).tolist():
+            for h in self._missing.tolist():
+                weighed[h] = weighed[h].shown_by(weighed[healthy], curved)
+        return [replace(one, log_evidence=total[:, h]) for h, one in enumerate(weighed)]
 
     def _with_way(self, h: int, settled: MarginalLikelihood | None) -> MarginalLikelihood:
         """Return what runs say of a hypothesis, those on whose way it counts by all readings."""

@@ -14,7 +14,7 @@ Section: docs/inference.md#change-points
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,6 +57,19 @@ class MarginalLikelihood:
     by_movement: Callable[[int], FloatArray]
     settled: Callable[[int], FloatArray]
     estimate: Callable[[int], Estimate]
+
+    def shown_by(self, other: MarginalLikelihood, where: BoolArray) -> MarginalLikelihood:
+        """Return the same with the movements of some runs as another hypothesis has them.
+
+        Args:
+            other: That hypothesis.
+            where: Which runs, (run,).
+        """
+        return replace(
+            self,
+            by_movement=lambda run: (other if where[run] else self).by_movement(run),
+            settled=lambda run: (other if where[run] else self).settled(run),
+        )
 
 
 # The change point: the first movement m0 that a fault spoils, and the cell z of all else unknown.

@@ -9,6 +9,8 @@ Section: docs/inference.md#set-ups
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from failuretwin.core.types import FloatArray
@@ -19,12 +21,26 @@ NOWHERE = "the tool is nowhere near where it should be"
 """What is said of a run that fits no hypothesis."""
 MISFITS, MAY_MISFIT = "the log does not fit the profile", "the log may not fit the profile"
 """What is said of a set-up that is wrong, or may be."""
+UNDONE = "; judged with that undone"
+"""Said behind that of a set-up that is wrong for sure."""
 ANOTHER = "no fault explains it, and the set-up is not wrong in one way that is known"
 """What is said of a set-up that nothing explains."""
 ELSEWHERE = "the sensor does not seem to stand where the profile says"
 """What is said of a sensor that was moved."""
 DOUBTS = (MISFITS, MAY_MISFIT, ANOTHER, ELSEWHERE, NOWHERE)
 """Remarks by which a set-up is uncertain."""
+
+
+def undone(remarks: Iterable[str]) -> str:
+    """Return what is wrong with the set-up of a log that is judged with that undone; empty: none.
+
+    Args:
+        remarks: On the log, such as ``the log does not fit the profile (99.3 % sure): ...``.
+    """
+    said = next((line for line in remarks if UNDONE in line), "")
+    return said.partition("): ")[2].partition(": ")[0]
+
+
 NEAR = 0.12
 """Median distance, in that of the poses from their middle, within which a set-up explains a log:
 sag and scatter of a printed arm take up half of it."""
