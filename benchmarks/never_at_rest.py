@@ -14,7 +14,8 @@ it: by another error after each stroke, or, on curves, by one that comes in mid-
 `--rest` an arm stands still for the last seconds of its runs. With `--also lag` motors also come to
 follow 0.2 s late in mid-run, with `--also slow` they lose half of their speed: ramps take twice as
 long and begin where the last was cut off, on curves the motor keeps below half of its largest
-speed. With `--also backlash` joints come to have play. With
+speed. With `--also backlash` joints come to have play, with `--also intermittent` motors stick now
+and then. With
 `--told` the diagnosis is told the shares of healthy and faulty runs and the sizes of errors as
 drawn: only then can the calibration error be that of chance.
 """
@@ -43,6 +44,8 @@ from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.servo import first_order_lag
 from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin, Drive, ServoEngine
+from failuretwin.failure_behavior.fault import draw_episodes
+from failuretwin.failure_behavior.registry import MODES as MODE_TABLE
 
 STEP_S, DURATION_S = 0.008, 10.0
 DELAY_S, LAG_S = (0.0, 0.05), (0.02, 0.05)
@@ -160,6 +163,8 @@ SLOW, SPEED = "slow", 0.5
 """The mode of motors that lose speed, and what is left of it."""
 PLAY, PLAY_RAD = "backlash", (0.06, 0.14)
 """The mode of joints with play, and the range of the play [rad]."""
+STICKS, SHARE = "intermittent", (0.2, 0.6)
+"""The mode of motors that stick now and then, and the share of the time that they do."""
 
 
 def cases(
@@ -242,7 +247,7 @@ def simulated(
     speed = np.gradient(command, STEP_S, axis=0)
     friction = np.asarray(settling.friction) * _direction(speed)
     followed = command.copy()
-    if case.fault in (LATE, SLOW, PLAY):
+    if case.fault in (LATE, SLOW, PLAY, STICKS):
         onset = rng.uniform(*ONSET_OF_CURVES) * duration_s
     told = command[:, max(case.motor, 0)]
     if case.fault == SLOW and motion is blended:
@@ -262,6 +267,12 @@ def simulated(
     if case.fault == "stuck":
         onset = rng.uniform(0.0, 0.7 * duration_s)
         held[0, time >= onset, case.motor] = True
+    if case.fault == STICKS:
+        parts = draw_episodes(
+            onset, duration_s, rng.uniform(*SHARE), MODE_TABLE[STICKS].episode_s, rng
+        )
+        for begin, end in parts:
+            held[0, (time >= begin) & (time < end), case.motor] = True
     drive = Drive(wanted[None], held, compliance=arm.compliance[None])
     position = ServoEngine(robot).angles(drive, time)[0]
     measured, read = _sensed(robot, position, time, rate, late, rng)
@@ -492,7 +503,7 @@ def line(found: list[Diagnosis], seconds: float) -> str:
     healthy = [d for d in found if d.truth == "healthy"]
     false = sum(d.diagnosis != "healthy" for d in healthy)
     parts = [f"healthy blamed {false} of {len(healthy)}"]
-    for mode in (*MODES, LATE, SLOW, PLAY):
+    for mode in (*MODES, LATE, SLOW, PLAY, STICKS):
         some = [d for d in found if str(d.truth).endswith(mode)]
         if some or mode in MODES:
             parts.append(f"{mode} {int(right(some).sum())} of {len(some)}")
@@ -539,7 +550,7 @@ def main() -> None:
     parser.add_argument("--rest", type=float, default=0.0, help="last seconds that stand still")
     parser.add_argument("--sensing", default="tool", help="what is believed")
     parser.add_argument(
-        "--also", nargs="+", default=[], choices=[LATE, SLOW, PLAY], help="more faults"
+        "--also", nargs="+", default=[], choices=[LATE, SLOW, PLAY, STICKS], help="more faults"
     )
     parser.add_argument("--logs")
     parser.add_argument("--share", type=float)

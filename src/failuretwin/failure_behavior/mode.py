@@ -247,6 +247,11 @@ class FaultMode(ABC):
         return self.sizes or drawn
 
     @property
+    def in_episodes(self) -> bool:
+        """Whether it is always one that misses movements as the motor sticks in episodes."""
+        return self.signature is Signature.MISSED and self.allowed_profiles == (INTERMITTENT,)
+
+    @property
     def reaction(self) -> Reaction:
         """Reaction of an arm that goes on working."""
         return self.own_reaction or USUAL_REACTION[self.signature]

@@ -216,8 +216,8 @@ def test_a_motor_that_follows_later_is_found_and_timed():
 
 
 def test_movements_of_a_curve_do_not_speak_for_what_does_not_show_on_it():
-    """A motor that stands now and then misses no movement: a curve is one."""
-    told = ["healthy", "motor_2:intermittent"]
+    """A motor that loses commands misses no movement: a curve is one."""
+    told = ["healthy", "motor_2:lost_commands"]
     (found,) = ft.diagnose(late_run(curve(), 0.0), ROBOT, "generic", hypotheses=told)
     assert found.evidence
     assert all(one.nats == 0.0 for one in found.evidence)

@@ -151,12 +151,13 @@ def test_missed_movements_do_not_show_on_a_curve_which_is_one():
     _, command = curve()
     late = broken(command, 1, 20, lambda way: command[: len(way), 1])
     asked = ["healthy", "motor_2:lag", "motor_2:intermittent", "motor_2:lost_commands"]
+    odds = [prior_odds(Hypothesis.parse(name)) for name in asked[2:]]
     for followed in (command, late):
         runs = exact_run(ROBOT, command, followed)
         (found,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=asked)
-        sound, _, *missed = (found.posterior[name] for name in asked)
-        odds = [prior_odds(Hypothesis.parse(name)) for name in asked[2:]]
-        assert np.divide(missed, sound) == pytest.approx(odds, rel=1e-6)
+        sound, _, sticks, missed = (found.posterior[name] for name in asked)
+        assert missed / sound == pytest.approx(odds[1], rel=1e-6)
+        assert followed is late or sticks / sound < 0.1 * odds[0]  # as nothing sticks
 
 
 @pytest.mark.parametrize(

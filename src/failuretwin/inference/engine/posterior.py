@@ -89,6 +89,11 @@ def _onset(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) ->
     rows, one = evidence.rows[h], evidence.weighed[h]
     if rows.onsets is None:
         return None
+    if rows.episodes is not None:
+        of_run = int(one.picks.run[some[0]])
+        first = _of_episodes(evidence, h, some, share).sum(axis=1)
+        onset, part = rows.episodes.onset[of_run], rows.episodes.part[of_run]
+        return Weighted(onset.ravel(), (first[:, None] * part).ravel())
     run, row = one.picks.run[some].tolist(), one.picks.row[some].tolist()
     told = zip(run, row, one.amount[some], strict=True)
     parts = [rows.onsets(*one) for one in told]
@@ -100,6 +105,8 @@ def _onset(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) ->
 
 def _size(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> Weighted | None:
     rows = evidence.rows[h]
+    if rows.episodes is not None:
+        return Weighted(rows.episodes.sizes, _of_episodes(evidence, h, some, share).sum(axis=0))
     if rows.drawn is not None:
         some, share = some[share > LEAST_SHARE], share[share > LEAST_SHARE]
         mean, deviation = _mean_squares(evidence, h, some)
@@ -118,6 +125,23 @@ def _size(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> 
     if rows.drawn is not None:  # the mean square is nearly normal, not its root
         values = np.sqrt(np.maximum(values, 0.0))
     return Weighted(values.ravel(), weights.ravel())
+
+
+def _of_episodes(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> FloatArray:
+    """Return the first moment that sticks and the share of time of a run, (moment, size)."""
+    rows, one = evidence.rows[h], evidence.weighed[h]
+    assert rows.episodes is not None
+    picks, found = one.picks[some], one.found.share[some]
+    kept = evidence.part(h, picks).kept
+    held = np.where(rows.episodes.held[kept], found, 0.0).sum(axis=-1)
+    arrived = np.where(kept == 0, found, 0.0).sum(axis=-1)
+    usable = evidence.scene.moments.usable[picks.run]
+    told = np.where(usable, held, 0.0), np.where(usable, arrived, 0.0)
+    parts = [
+        rows.episodes.posterior(run, row, int(rows.first[row]), (p, q))
+        for run, row, p, q in zip(picks.run.tolist(), picks.row.tolist(), *told, strict=True)
+    ]
+    return np.einsum("p,pms->ms", share, np.stack(parts))
 
 
 def _amounts(evidence: RunsEvidence, h: int, some: IntArray) -> FloatArray:

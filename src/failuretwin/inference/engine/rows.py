@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.numerics import log_of, log_sum
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.engine.integral import Noise
 from failuretwin.inference.engine.moments import Moments
 from failuretwin.inference.engine.outcomes import Outcomes
@@ -48,6 +49,55 @@ class Drawn:
 
 
 @dataclass(frozen=True)
+class Episodes:
+    """A motor that sticks with a share s of the time, from an onset on.
+
+    Of a row with the share s_0, in which a moment was in an episode with probability p, and all
+    commands arrived in it with q, another share changes what the moment says by
+
+        p s / s_0 + q (1 - s) / (1 - s_0) + 1 - p - q
+
+    and an onset after it by the same with s = 0.
+
+    Attributes:
+        share: s_0 of each row, (row,).
+        held: Which outcomes are in an episode, (outcome,); the first is that all commands arrive.
+        sizes: Shares that are told, of the same prior probability, (size,).
+        log_first: Log prior that each moment is the first affected, (run, moment).
+        onset: Samples of the onset before each, (run, moment, sample) [s].
+        part: Their shares, same axes.
+    """
+
+    share: FloatArray
+    held: BoolArray
+    sizes: FloatArray
+    log_first: FloatArray
+    onset: FloatArray
+    part: FloatArray
+
+    def posterior(
+        self, run: int, row: int, first: int, outcomes: tuple[FloatArray, FloatArray]
+    ) -> FloatArray:
+        """Return how probable each first moment and size is, (moment, size).
+
+        Args:
+            run: Index of the run.
+            row: Index of the row.
+            first: Its first moment affected: no earlier one is told.
+            outcomes: p and q, (moment,) each.
+        """
+        (held, arrived), usual = outcomes, self.share[row]
+        other = np.maximum(1.0 - held - arrived, 0.0)[:, None]
+        sound = arrived[:, None] / (1.0 - usual)
+        after = log_of(held[:, None] * self.sizes / usual + sound * (1.0 - self.sizes) + other)
+        before = log_of(sound + other)
+        so_far = np.cumsum(before - after, axis=0) - (before - after)
+        joint = so_far + after.sum(axis=0) + self.log_first[run][:, None]
+        joint[:first] = -np.inf
+        return np.asarray(np.exp(joint - log_sum(joint.ravel(), axis=0)))
+
+
+@dataclass(frozen=True)
 class Rows:
     """Rows of one hypothesis.
 
@@ -68,6 +118,7 @@ class Rows:
         tie: What theta adds to the amount, so that the amount itself is less in doubt,
             (run, row, theta); None: nothing.
         own: Places in theta that say nothing any more from the onset on.
+        episodes: The share of the time that a motor sticks; None: it does not.
         shared: Index of each row along the axis of outcomes and columns, (row,); None: each has its
             own, or all have the same.
     """
@@ -87,6 +138,7 @@ class Rows:
     onsets: Onsets | None = None
     tie: FloatArray | None = None
     own: Sequence[int] = ()
+    episodes: Episodes | None = None
     shared: IntArray | None = None
 
     @property

@@ -23,6 +23,7 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.modes import EncoderBias
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.engine.episode_rows import episode_rows
 from failuretwin.inference.engine.filter import RowsPosterior
 from failuretwin.inference.engine.healthy_rows import healthy_rows
 from failuretwin.inference.engine.held_rows import held_rows
@@ -94,17 +95,19 @@ def _by_components(picks: Picks, run: IntArray, component: IntArray) -> Picks:
     return Picks(picks.run[pick], picks.row[pick], component[of])
 
 
-def has_rows(hypothesis: Hypothesis, moving: bool = False) -> bool:
+def has_rows(hypothesis: Hypothesis, moving: bool = False, curved: bool = False) -> bool:
     """Return whether moments tell of a hypothesis: healthy, or one motor that settles off.
 
     Args:
         hypothesis: What may be the case.
         moving: Whether there are moments on the way, which tell of one that is late or slow too.
+        curved: Whether some are on curves, which tell of one that sticks now and then too.
     """
     if not hypothesis.known or len(hypothesis.faults) > 1:
         return False
-    signatures = {MODES[fault.mode].signature for fault in hypothesis.faults}
-    return Signature.MISSED not in signatures and (moving or Signature.TRANSIENT not in signatures)
+    modes = [MODES[fault.mode] for fault in hypothesis.faults]
+    told = {Signature.TRANSIENT: moving, Signature.MISSED: False}
+    return all(curved if one.in_episodes else told.get(one.signature, True) for one in modes)
 
 
 def rows_of(scene: Scene, hypothesis: Hypothesis, hypotheses: Sequence[Hypothesis]) -> Rows:
@@ -117,6 +120,8 @@ def rows_of(scene: Scene, hypothesis: Hypothesis, hypotheses: Sequence[Hypothesi
         return held_rows(scene, motor)
     if mode.signature is Signature.REDRAWN_OFFSET:
         return redrawn_rows(scene, motor, mode, _zero_of(fault.motor) not in hypotheses)
+    if mode.in_episodes:
+        return episode_rows(scene, motor, mode)
     winds = mode.signature is Signature.OFFSET and mode.hysteresis and scene.layout.moving
     if winds or mode.signature is Signature.TRANSIENT:
         return way_rows(scene, motor, mode)

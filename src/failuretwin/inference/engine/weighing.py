@@ -24,7 +24,7 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.healthy_rows import changes
-from failuretwin.inference.engine.moments import LOSSY, moments_of
+from failuretwin.inference.engine.moments import LOSSY, Moments, moments_of
 from failuretwin.inference.engine.posterior import (
     marginal_likelihoods as engine_likelihoods,
 )
@@ -101,27 +101,60 @@ class Weighing:
     @cached_property
     def with_rows(self) -> IntArray:
         """Hypotheses with rows."""
-        return np.flatnonzero([has_rows(h, self.layout.moving) for h in self.hypotheses])
+        told = self.layout.moving, bool(self.curved.any())
+        return np.flatnonzero([has_rows(h, *told) for h in self.hypotheses])
+
+    @cached_property
+    def moments(self) -> Moments:
+        """The moments."""
+        if self.known is not None:
+            return self.known.scene.moments
+        model = self.likelihood.model
+        seen = registered_evidence(self.likelihood.evidence, self.place, model.sensors)
+        moments = moments_of(model, seen)
+        return moments if self.lag_s is None else moments.trailing(self.lag_s)
+
+    @cached_property
+    def curved(self) -> BoolArray:
+        """Which runs follow curves, (run,)."""
+        return np.asarray(self.moments.on_curves.any(axis=1))
 
     @cached_property
     def evidence(self) -> RunsEvidence:
         """What the runs say of the hypotheses with rows."""
         if self.known is not None:
             return self.known
-        model = self.likelihood.model
-        seen = registered_evidence(self.likelihood.evidence, self.place, model.sensors)
-        moments = moments_of(model, seen)
         scene = Scene.of(
-            model.without_doubt,
-            moments if self.lag_s is None else moments.trailing(self.lag_s),
+            self.likelihood.model.without_doubt,
+            self.moments,
             self.priors,
             self.layout,
             self.components.usual if self.spread is None else self.spread,
         )
         hypotheses = [self.hypotheses[i] for i in self.with_rows]
-        asked = None if self.asked is None else self.asked[:, self.with_rows]
         odds = self.log_odds[self.with_rows]
-        return RunsEvidence(scene, hypotheses, self.components, odds, asked)
+        return RunsEvidence(scene, hypotheses, self.components, odds, self._asked)
+
+    @property
+    def _asked(self) -> BoolArray | None:
+        """Which hypotheses with rows are weighed, (run, hypothesis); None: all.
+
+        One at least that node sums know too: the most probable theta is that of the best of these.
+        """
+        missed = np.isin(self.with_rows, self._missing)
+        if self.asked is None and not missed.any():
+            return None
+        every = np.ones((len(self.curved), len(self.hypotheses)), dtype=bool)
+        asked = (every if self.asked is None else self.asked)[:, self.with_rows]
+        asked[:, missed] &= self.curved[:, None]
+        nothing = ~asked[:, self._summed_too].any(axis=1)
+        asked[nothing] |= self._summed_too
+        return np.asarray(asked)
+
+    @cached_property
+    def _summed_too(self) -> BoolArray:
+        """Which hypotheses with rows node sums know too, (hypothesis,)."""
+        return np.array([has_rows(self.hypotheses[i]) for i in self.with_rows])
 
     @cached_property
     def best(self) -> tuple[IntArray, FloatArray]:
@@ -129,8 +162,7 @@ class Weighing:
 
         They do not know what late and slow motors do on the way.
         """
-        known = np.array([has_rows(self.hypotheses[i]) for i in self.with_rows])
-        return most_probable_theta(self.evidence, known)
+        return most_probable_theta(self.evidence, self._summed_too)
 
     @cached_property
     def at_best(self) -> RunLikelihood:
@@ -152,7 +184,7 @@ class Weighing:
     def summed(self) -> IntArray:
         """Runs that node sums weigh too: all, or those on whose way readings count."""
         way, runs = self.likelihood.moving, np.arange(len(self.likelihood.usable))
-        if len(self.with_rows) < len(self.hypotheses):
+        if self._by_sums:
             return runs
         return runs[:0] if way is None else np.flatnonzero(way.seen.any(axis=(1, 2)))
 
@@ -186,7 +218,7 @@ class Weighing:
     def _log_settled(self) -> FloatArray:
         """The same by settled positions alone."""
         found = self.evidence.log_evidence
-        if len(self.with_rows) == len(self.hypotheses):
+        if not self._by_sums:
             return found
         settled = np.stack([one.log_evidence for one in self._settled_at_best], axis=1)
         rows, (best, _) = np.arange(len(found)), self.best
@@ -195,12 +227,25 @@ class Weighing:
             -self.evidence.lossy[rows, best, None]
         )
         table = found[rows, :, best][..., None] + more[:, None]
-        table[..., self.with_rows] = found
-        curved = np.flatnonzero(self.evidence.scene.moments.on_curves.any(axis=1))
-        for h in np.flatnonzero([one.is_healthy for one in self.hypotheses]).tolist():
-            # A curve is one movement: a motor that misses some looks like a healthy one.
-            table[curved[:, None], :, self._missing] = table[curved, :, h][:, None]
+        for i, h in enumerate(self.with_rows.tolist()):
+            told = self.curved if h in self._missing else np.ones_like(self.curved)
+            table[told, :, h] = found[told, :, i]
+        for h, one in self._as_on_curves.items():
+            table[self.curved, :, h] = table[self.curved, :, one]
         return np.asarray(table)
+
+    @cached_property
+    def _by_sums(self) -> bool:
+        """Whether some hypotheses are weighed by node sums, in some runs at least."""
+        alone = len(self.with_rows) - np.isin(self.with_rows, self._missing).sum()
+        return bool(alone < len(self.hypotheses))
+
+    @property
+    def _as_on_curves(self) -> dict[int, int]:
+        """Hypotheses that look like another on curves, which are one movement: a healthy motor."""
+        healthy = [h for h, one in enumerate(self.hypotheses) if one.is_healthy]
+        missing = [h for h in self._missing.tolist() if h not in self.with_rows]
+        return {h: one for h in missing for one in healthy}
 
     @cached_property
     def _missing(self) -> IntArray:
@@ -229,24 +274,29 @@ class Weighing:
         says = engine_likelihoods(self.evidence)
         found = dict(zip(self.with_rows.tolist(), says, strict=True))
         weighed = [self._with_way(h, found.get(h)) for h in range(len(self.hypotheses))]
-        curved = self.evidence.scene.moments.on_curves.any(axis=1)
-        for healthy in np.flatnonzero([h.is_healthy for h in self.hypotheses]).tolist():
-            for h in self._missing.tolist():
-                weighed[h] = weighed[h].shown_by(weighed[healthy], curved)
+        for h, one in self._as_on_curves.items():
+            weighed[h] = weighed[h].shown_by(weighed[one], self.curved)
         return [replace(one, log_evidence=total[:, h]) for h, one in enumerate(weighed)]
 
     def _with_way(self, h: int, settled: MarginalLikelihood | None) -> MarginalLikelihood:
-        """Return what runs say of a hypothesis, those on whose way it counts by all readings."""
+        """Return what runs say of a hypothesis, those on whose way it counts by all readings.
+
+        Of a motor that sticks now and then the engine tells on curves alone.
+        """
         way, summed = self.likelihood.moving, self.summed
         if settled is None:
             return self._whole_at_best[h]
-        if way is None or not len(summed):
+        whole = np.zeros(len(self.curved), dtype=bool)
+        if way is not None:
+            whole[summed] = way.seen[summed].any(axis=(1, 2))
+        if h in self._missing:
+            whole = ~self.curved
+        if not whole.any():
             return settled
-        whole = self._whole_at_best[h]
-        said = [(settled, run) for run in range(len(way.seen))]
+        said = [(settled, run) for run in range(len(whole))]
         for at, run in enumerate(summed.tolist()):
-            if way.seen[run].any():
-                said[run] = whole, at
+            if whole[run]:
+                said[run] = self._whole_at_best[h], at
         return MarginalLikelihood(
             settled.log_evidence,
             lambda run: said[run][0].by_movement(said[run][1]),

@@ -1,0 +1,106 @@
+"""A motor that sticks now and then while it follows a curve."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from inference.engine.test_on_the_way import ROBOT, STEP_S, curve
+from little_logs import exact_run
+
+import failuretwin as ft
+from failuretwin.core.numerics import log_of
+from failuretwin.failure_behavior.fault import draw_episodes
+from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.engine.episode_rows import ages
+from failuretwin.inference.engine.rows import Episodes
+
+HYPOTHESES = [
+    "healthy",
+    *(
+        f"motor_{k}:{mode}"
+        for k in (1, 2, 3)
+        for mode in ("stuck", "steady_state_error", "lag", "intermittent")
+    ),
+]
+
+
+def sticking(command, motor, episodes):
+    """Return what an arm does whose motor stays where it is in some episodes [s]."""
+    followed = command.copy()
+    for begin, end in episodes:
+        first, last = round(begin / STEP_S), round(end / STEP_S)
+        followed[first:last, motor] = followed[first, motor]
+    return followed
+
+
+def test_ages_are_those_of_drawn_episodes():
+    rng = np.random.default_rng(2)
+    episodes = np.array(draw_episodes(0.0, 40_000.0, 0.5, (0.5, 2.0), rng))
+    begin, end = episodes.T
+    time = rng.uniform(0.0, 40_000.0, 200_000)
+    which = np.searchsorted(begin, time) - 1
+    age = (time - begin[which])[time < end[which]]
+    edges, probability = ages((0.5, 2.0))
+    seen, _ = np.histogram(age, edges)
+    assert seen / seen.sum() == pytest.approx(probability, abs=0.01)
+
+
+def test_share_and_onset_are_those_of_all_ways_to_stick():
+    rng = np.random.default_rng(5)
+    moments, usual = 6, 0.4
+    held, sound, other = rng.uniform(0.05, 1.0, (3, moments))
+    total = usual * held + (1.0 - usual) * sound + other
+    prior, sizes = rng.dirichlet(np.ones(moments)), np.array([0.2, 0.4, 0.7])
+    nothing = np.zeros((1, moments, 1))
+    episodes = Episodes(
+        np.array([usual]), np.zeros(1) > 0, sizes, log_of(prior)[None], nothing, nothing
+    )
+    told = usual * held / total, (1.0 - usual) * sound / total
+    expected = np.zeros((moments, len(sizes)))
+    for (first, begun), (k, size) in product(enumerate(prior), enumerate(sizes)):
+        for ways in product((True, False), repeat=moments):  # in an episode or not
+            weight = begun
+            for m, sticks in enumerate(ways):
+                share = size if m >= first else 0.0
+                known = held[m] if sticks else sound[m]
+                there = share if sticks else 1.0 - share
+                weight *= there * known + there * other[m]
+            expected[first, k] += weight
+    assert episodes.posterior(0, 0, 0, told) == pytest.approx(expected / expected.sum(), rel=1e-9)
+    later = expected * (np.arange(moments) >= 2)[:, None]
+    assert episodes.posterior(0, 0, 2, told) == pytest.approx(later / later.sum(), rel=1e-9)
+
+
+@pytest.mark.parametrize("motor", [0, 1, 2])
+def test_a_motor_that_sticks_on_a_curve_is_found(motor):
+    command, episodes = curve(12.0), [(1.0, 2.2), (3.5, 4.3), (5.6, 7.2), (9.0, 10.1)]
+    runs = exact_run(ROBOT, command, sticking(command, motor, episodes))
+    (found,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=HYPOTHESES)
+    assert str(found.diagnosis) == f"motor_{motor + 1}:intermittent"
+    assert found.probability > 0.9
+    share = sum(end - begin for begin, end in episodes) / 12.0
+    assert found.magnitude_90[0] < share < found.magnitude_90[1]
+    assert found.onset_90[0] <= 1.0
+    worst = max(found.evidence, key=lambda one: one.nats)
+    assert worst.nats > 1.0
+
+
+def test_an_onset_in_mid_run_lies_in_its_interval():
+    command, episodes = curve(16.0), [(9.0, 10.8), (11.5, 13.0), (13.8, 15.6)]
+    runs = exact_run(ROBOT, command, sticking(command, 1, episodes))
+    (found,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=HYPOTHESES)
+    assert str(found.diagnosis) == "motor_2:intermittent"
+    assert found.onset_90[0] <= 9.0 <= found.onset_90[1]
+
+
+def test_a_motor_that_stays_where_it_is_for_good_does_not_stick_now_and_then():
+    command = curve(8.0)
+    runs = exact_run(ROBOT, command, sticking(command, 1, [(3.0, 8.1)]))
+    (found,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=HYPOTHESES)
+    assert str(found.diagnosis) == "motor_2:stuck"
+
+
+def test_the_mode_says_that_it_comes_in_episodes():
+    assert MODES["intermittent"].in_episodes
+    assert not MODES["lost_commands"].in_episodes
+    assert not MODES["stuck"].in_episodes
