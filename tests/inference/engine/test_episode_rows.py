@@ -1,18 +1,22 @@
 """A motor that sticks now and then while it follows a curve."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
-from inference.engine.test_on_the_way import ROBOT, STEP_S, curve
-from little_logs import exact_run
 
 import failuretwin as ft
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_of
 from failuretwin.failure_behavior.fault import draw_episodes
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.episode_rows import ages
+from failuretwin.inference.engine.registration import robot_weighing
 from failuretwin.inference.engine.rows import Episodes
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from inference.engine.test_on_the_way import ROBOT, STEP_S, curve, moments, zigzag
+from little_logs import exact_run
 
 HYPOTHESES = [
     "healthy",
@@ -47,18 +51,18 @@ def test_ages_are_those_of_drawn_episodes():
 
 def test_share_and_onset_are_those_of_all_ways_to_stick():
     rng = np.random.default_rng(5)
-    moments, usual = 6, 0.4
-    held, sound, other = rng.uniform(0.05, 1.0, (3, moments))
+    count, usual = 6, 0.4
+    held, sound, other = rng.uniform(0.05, 1.0, (3, count))
     total = usual * held + (1.0 - usual) * sound + other
-    prior, sizes = rng.dirichlet(np.ones(moments)), np.array([0.2, 0.4, 0.7])
-    nothing = np.zeros((1, moments, 1))
+    prior, sizes = rng.dirichlet(np.ones(count)), np.array([0.2, 0.4, 0.7])
+    nothing = np.zeros((1, count, 1))
     episodes = Episodes(
         np.array([usual]), np.zeros(1) > 0, sizes, log_of(prior)[None], nothing, nothing
     )
     told = usual * held / total, (1.0 - usual) * sound / total
-    expected = np.zeros((moments, len(sizes)))
+    expected = np.zeros((count, len(sizes)))
     for (first, begun), (k, size) in product(enumerate(prior), enumerate(sizes)):
-        for ways in product((True, False), repeat=moments):  # in an episode or not
+        for ways in product((True, False), repeat=count):  # in an episode or not
             weight = begun
             for m, sticks in enumerate(ways):
                 share = size if m >= first else 0.0
@@ -67,7 +71,7 @@ def test_share_and_onset_are_those_of_all_ways_to_stick():
                 weight *= there * known + there * other[m]
             expected[first, k] += weight
     assert episodes.posterior(0, 0, 0, told) == pytest.approx(expected / expected.sum(), rel=1e-9)
-    later = expected * (np.arange(moments) >= 2)[:, None]
+    later = expected * (np.arange(count) >= 2)[:, None]
     assert episodes.posterior(0, 0, 2, told) == pytest.approx(later / later.sum(), rel=1e-9)
 
 
@@ -98,6 +102,23 @@ def test_a_motor_that_stays_where_it_is_for_good_does_not_stick_now_and_then():
     runs = exact_run(ROBOT, command, sticking(command, 1, [(3.0, 8.1)]))
     (found,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=HYPOTHESES)
     assert str(found.diagnosis) == "motor_2:stuck"
+
+
+@pytest.mark.parametrize("way", ["ramps", "curve"])
+def test_a_run_of_which_the_engine_is_asked_nothing_keeps_its_evidence(way):
+    """A motor that misses movements of ramps is weighed at the theta of the best other fault."""
+    command = zigzag() if way == "ramps" else curve()
+    followed = sticking(command, 1, [(0.9, 2.6), (3.1, 4.6)])
+    healthy, seen = moments(exact_run(ROBOT, command, followed))
+    hypotheses = [Hypothesis.parse(name) for name in HYPOTHESES]
+    weighing = robot_weighing(RunLikelihood(seen, healthy), hypotheses, ft.Priors())
+    sticks = HYPOTHESES.index("motor_2:intermittent")
+    asked = np.zeros((1, len(hypotheses)), dtype=bool)
+    asked[0, sticks] = True
+    alone = replace(weighing, asked=asked)
+    told = (one.by_hypothesis[0, sticks] for one in (alone, weighing))
+    assert next(told) == pytest.approx(next(told), abs=0.3)
+    assert np.isfinite(alone.share).all()
 
 
 def test_the_mode_says_that_it_comes_in_episodes():
