@@ -100,8 +100,10 @@ class Table:
         """Return columns as numbers, (row, column); NaN for text and empty cells."""
         import pandas as pd
 
-        part = self.cells[list(columns)].apply(pd.to_numeric, errors="coerce")
-        return part.to_numpy(dtype=np.float64)
+        values = np.empty((len(self.cells), len(columns)))
+        for place, column in enumerate(columns):
+            values[:, place] = pd.to_numeric(self.cells[column], errors="coerce")
+        return values
 
     def numbers(self, columns: Sequence[str], *, gaps: bool = True) -> FloatArray:
         """Return columns as numbers, (row, column); NaN for empty cells, which only `gaps` allows.
@@ -110,19 +112,22 @@ class Table:
             InputError: If a column is missing or a cell is no number.
         """
         self.check(columns)
-        part, values = self.cells[list(columns)], self.values(columns)
-        wrong = ~np.isfinite(values)
-        if gaps:
-            wrong &= part.notna().to_numpy()
-            wrong &= ~part.apply(lambda c: c.str.strip().str.lower().isin(["nan", ""])).to_numpy()
-        if wrong.any():
-            row, column = np.argwhere(wrong)[0]
-            line, expected = int(part.index[row]) + 2, _expected(float(values[row, column]), gaps)
-            raise InputError(
-                f"{self.path}: line {line}, column {columns[column]}: got "
-                f"{part.iloc[row, column]!r}, expected {expected}"
-            )
+        values = self.values(columns)
+        cells = [self.cells[column].to_numpy() for column in columns]
+        for row, place in np.argwhere(~np.isfinite(values)).tolist():
+            cell = cells[place][row]
+            if not (gaps and _is_empty(cell)):
+                line = int(self.cells.index[row]) + 2
+                raise InputError(
+                    f"{self.path}: line {line}, column {columns[place]}: got {cell!r}, expected "
+                    f"{_expected(values[row, place], gaps)}"
+                )
         return values
+
+
+def _is_empty(cell: object) -> bool:
+    """Return whether a cell holds nothing."""
+    return not isinstance(cell, str) or cell.strip().lower() in ("nan", "")
 
 
 def _expected(value: float, gaps: bool) -> str:
