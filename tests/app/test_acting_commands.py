@@ -7,7 +7,7 @@ import pytest
 
 import failuretwin as ft
 from failuretwin import DigitalTwin, InputError
-from failuretwin.app.arms import emulation_with, held_of, spared_of
+from failuretwin.app.arms import emulation_with, held_of, size_of, spared_of
 from failuretwin.digital_model.calibrated_robot import calibrated
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -142,11 +142,27 @@ def test_faults_of_an_emulated_arm(armpi):
 
 def test_held_motors_in_words(armpi):
     assert held_of("motor_2:stuck=-0.5", armpi) == ("motor_2", -0.5)
+    assert held_of("motor_2:stuck=-90deg", armpi) == ("motor_2", pytest.approx(-np.pi / 2))
     with pytest.raises(InputError, match="motor_9"):
         held_of("motor_9:stuck=1", armpi)
     for text in ("motor_2:stuck", "motor_2:drift=1", "healthy"):
         with pytest.raises(InputError, match="MOTOR:stuck=SIZE"):
             held_of(text, armpi)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "size"),
+    [("2", "rad", 2.0), ("2rad", "rad", 2.0), ("-180deg", "rad", -np.pi), ("20%", "ratio", 0.2),
+     ("360deg/s", "rad/s", 2 * np.pi), ("5ms", "s", 0.005), ("5s", "s", 5.0)],
+)  # fmt: skip
+def test_sizes_are_in_the_unit_of_the_mode_or_say_theirs(text, unit, size):
+    assert size_of(text, unit, "size") == pytest.approx(size)
+
+
+@pytest.mark.parametrize(("text", "unit"), [("2deg", "s"), ("2mm", "rad"), ("deg", "rad")])
+def test_other_units_are_refused_with_those_that_are_known(text, unit):
+    with pytest.raises(InputError, match=rf"size is '{text}'"):
+        size_of(text, unit, "size")
 
 
 def test_a_task_in_python():

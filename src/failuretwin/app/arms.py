@@ -112,8 +112,8 @@ def emulation_with(faults: Sequence[str], known: CalibratedRobot, seed: int) -> 
         schedule.append(scheduled)
         if not size:
             continue
-        value = number_of(size, f"fault {text!r}: size")
         mode = modes[scheduled.fault.mode]
+        value = size_of(size, mode.unit, f"fault {text!r}: size")
         if isinstance(mode, Stuck):
             start[motors.index(scheduled.fault.motor)] = value
         elif sizes.setdefault(mode.mode, value) == value:
@@ -330,15 +330,39 @@ def number_of(value: str, what: str) -> float:
     return number
 
 
+OTHER_UNITS = {"rad": ("deg", np.pi / 180.0), "rad/s": ("deg/s", np.pi / 180.0)}
+OTHER_UNITS |= {"ratio": ("%", 0.01), "s": ("ms", 0.001)}
+"""The other unit in which a size can be given, and its factor, by the unit of the mode."""
+
+
+def size_of(value: str, unit: str, what: str) -> float:
+    """Return the size of a fault in the unit of its mode, such as 0.5deg in rad.
+
+    Args:
+        value: A number, in the unit of the mode unless another one follows it.
+        unit: The unit of the mode.
+        what: What it is, for errors.
+    """
+    other, factor = OTHER_UNITS.get(unit, (unit, 1.0))
+    theirs = value.endswith(other)
+    number = value.removesuffix(other if theirs else unit)
+    try:
+        return number_of(number, what) * (factor if theirs else 1.0)
+    except InputError:
+        raise InputError(
+            f"{what} is {value!r}, expected a number [{unit}], or one with {other} behind it."
+        ) from None
+
+
 def held_of(text: str, robot: Robot) -> tuple[str, float]:
     """Return motor and angle [rad] or position [m] in ``MOTOR:stuck=SIZE``."""
     name, _, size = text.partition("=")
     fault = Hypothesis.parse(name, robot.motor_names).faults
     if len(fault) != 1 or fault[0].mode != "stuck" or not size:
         raise InputError(
-            f"--fault is {text!r}, expected MOTOR:stuck=SIZE, such as motor_3:stuck=-0.35."
+            f"--fault is {text!r}, expected MOTOR:stuck=SIZE, such as motor_3:stuck=-20deg."
         )
-    return fault[0].motor, number_of(size, f"--fault {text!r}: size")
+    return fault[0].motor, size_of(size, Stuck.unit, f"--fault {text!r}: size")
 
 
 def spared_of(

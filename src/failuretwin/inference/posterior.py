@@ -435,14 +435,19 @@ class Posterior:
         untold = (gain > -AGAINST_NATS) & (gain < FOR_NATS)
         model, lines = self.likelihood.model, []
         travel = self.likelihood.evidence.movements.travel(run)
+        suspect = np.argsort(-self.log_posterior[run])[:2]
         for k, motor in enumerate(model.motor_names):
             own = [i for i, h in enumerate(self.hypotheses) if _is_of(h, motor)]
             held = [i for i in own if is_held(self.hypotheses[i])]
             moved = f"{motor.replace('_', ' ')} moved {_told_travel(model.twin.robot, k, travel)}"
+            hardly = travel[k] < HARDLY * model.least_visible[k]
             if own and untold[own].all():
-                lines.append(f"{moved}: little can be said of it")
-            elif untold[held].any() and travel[k] < HARDLY * model.least_visible[k]:
+                but = "" if hardly else ", which the sensors hardly show"
+                lines.append(f"{moved}{but}: little can be said of it")
+            elif hardly and untold[held].any():
                 lines.append(f"{moved}: if it is stuck, this hardly shows")
+            elif hardly and np.isin(suspect, own).any():
+                lines.append(f"{moved}: too little to tell what is wrong with it")
         return lines
 
 

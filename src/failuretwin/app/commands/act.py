@@ -136,8 +136,8 @@ def stop(place: str, topics: Path | None, robot: opt.RobotOptions) -> None:
 @click.option(
     "--fault",
     metavar="MOTOR:stuck=SIZE",
-    help="Stuck motor and its position [rad, m for one that slides]. Default: every motor in turn, "
-    "all over its travel.",
+    help="Stuck motor and its position [rad, m for one that slides], such as motor_2:stuck=-20deg. "
+    "Default: every motor in turn, all over its travel.",
 )
 @opt.space_options
 @opt.output_options("Write all points.", "Draw a map of the workspace there, reach.png.")

@@ -239,8 +239,8 @@ fault_option = click.option(
     multiple=True,
     metavar="MOTOR:MODE[=SIZE][@START[-END]]",
     help="Fault of an emulated robot, such as motor_3:stuck@40-80 (repaired after 80 s), "
-    "motor_3:stuck@40, or motor_2:slow=0.5 (SIZE in the unit of its mode). Can be given several "
-    "times.",
+    "motor_3:stuck@40, or motor_2:encoder_bias=2deg (SIZE in the unit of its mode, rad, s or a "
+    "ratio, unless deg, ms or % follows). Can be given several times.",
 )
 
 
