@@ -258,6 +258,18 @@ def test_a_motor_that_hardly_moves_is_named():
     assert told == ["motor 3 moved 0 deg: if it is stuck, this hardly shows"]
 
 
+def test_a_suspect_that_hardly_moves_is_named():
+    command = curve()
+    command[:, 2] = 0.3 + 0.05 * (command[:, 2] - command[:, 2].mean())
+    off = command.copy()
+    off[300:, 2] += 0.04
+    run = late_run(command, 0.0)
+    tool = DigitalTwin(ROBOT).path(off)[None]
+    (found,) = ft.diagnose(run.assign(measured=(run["measured"].dims, tool)), ROBOT, "generic")
+    told = [line for line in found.explanation if " moved " in line]
+    assert told == ["motor 3 moved 3 deg: too little to tell what is wrong with it"], found.posterior
+
+
 def test_points_of_an_arm_without_lag_are_those_of_the_command():
     healthy = model()
     for command in (zigzag(), curve()):
