@@ -267,7 +267,9 @@ def test_a_suspect_that_hardly_moves_is_named():
     tool = DigitalTwin(ROBOT).path(off)[None]
     (found,) = ft.diagnose(run.assign(measured=(run["measured"].dims, tool)), ROBOT, "generic")
     told = [line for line in found.explanation if " moved " in line]
-    assert told == ["motor 3 moved 3 deg: too little to tell what is wrong with it"], found.posterior
+    assert told == ["motor 3 moved 3 deg: too little to tell what is wrong with it"], (
+        found.posterior
+    )
 
 
 def test_points_of_an_arm_without_lag_are_those_of_the_command():
