@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import gamma
+from scipy.special import gammaincinv
 
 from failuretwin.core.errors import counted
 from failuretwin.core.hypothesis import Hypothesis
@@ -76,7 +76,7 @@ class FaultRate:
         """Interval of 90 %, low and high [1/h]."""
         ends = 0.5 + 0.5 * INTERVAL * np.array([-1.0, 1.0])
         scale = 1.0 / (WEIGHT / self.table_per_h + self.hours)
-        return np.asarray(gamma.ppf(ends, WEIGHT + self.confirmed, scale=scale))
+        return np.asarray(scale * gammaincinv(WEIGHT + self.confirmed, ends))
 
 
 def table_rates(hypotheses: Sequence[Hypothesis]) -> dict[str, float]:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from failuretwin.core.numerics import log_student
 from failuretwin.core.types import FloatArray, as_floats
@@ -132,7 +132,7 @@ def _sigma(r: FloatArray, sigma: float, dims: int) -> float:
     """Return the scatter at which its likelihood is greatest, from that before."""
     square = np.einsum("ia,ia->i", r, r)
     if np.isinf(sigma):
-        sigma = float(np.sqrt(np.median(square) / chi2.median(dims)))
+        sigma = float(np.sqrt(np.median(square) / (2.0 * gammaincinv(0.5 * dims, 0.5))))
     for _ in range(30):
         sigma = max(sigma, LEAST_SIGMA)
         weight = (DOF + dims) / (DOF + square / sigma**2)

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import beta, binom
+from scipy.special import bdtr, betaincinv
 
 from failuretwin.connection.calibration.observations import Observations
 from failuretwin.connection.calibration.result import SETTLING_UNITS, Z_95, Parameter
@@ -71,7 +71,7 @@ class Rate:
         """
         if self.hits == 0:
             return 0.0, 1.0 if self.trials == 0 else float(
-                beta.ppf(LEVEL[1], 0.5, self.trials + 0.5)
+                betaincinv(0.5, self.trials + 0.5, LEVEL[1])
             )
         low = 0.0 if self._below(0.0) <= LEVEL[1] else self._rate_at(LEVEL[1])
         return low, 1.0 if self.hits == self.trials else self._rate_at(LEVEL[0])
@@ -80,9 +80,9 @@ class Rate:
         """Return the probability of fewer hits, and half that of as many, if there are any."""
         if rate == 0.0:
             return 0.5 if self.hits == 1 else 1.0
-        none = binom.pmf(0, self.trials, rate)
-        fewer = binom.cdf(self.hits - 1, self.trials, rate) - none
-        return float((fewer + 0.5 * binom.pmf(self.hits, self.trials, rate)) / (1.0 - none))
+        none = (1.0 - rate) ** self.trials
+        fewer, up_to = bdtr([self.hits - 1, self.hits], self.trials, rate)
+        return float((0.5 * (fewer + up_to) - none) / (1.0 - none))
 
     def _rate_at(self, level: float) -> float:
         return float(brentq(lambda rate: self._below(rate) - level, 1e-9, 1.0 - 1e-9))
@@ -151,6 +151,8 @@ def median_interval(values: FloatArray) -> tuple[float, float, float]:
     How many of n values lie below the median is binomial; below six values even the extremes hold
     it less often than that.
     """
+    from scipy.stats import binom
+
     ordered, count = np.sort(values), len(values)
     rank = int(binom.ppf(LEVEL[0], count, 0.5))
     low = ordered[max(rank - 1, 0)]

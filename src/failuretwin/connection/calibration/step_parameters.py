@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from failuretwin.connection.calibration.parameters import LEARNED
 from failuretwin.connection.calibration.result import Z_95, Calibration, LeftOut, Parameter
@@ -55,7 +55,7 @@ def mean_interval(values: Sequence[float], blur: Sequence[float]) -> tuple[float
     if count > 1:
         observed = float(np.var(values, ddof=1)) / count
         if observed > variance:
-            variance, factor = observed, float(student.ppf(0.975, count - 1))
+            variance, factor = observed, float(stdtrit(count - 1, 0.975))
     half = factor * float(np.sqrt(variance))
     return mean, mean - half, mean + half
 
