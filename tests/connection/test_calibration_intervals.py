@@ -143,7 +143,7 @@ def test_doubt_about_the_lag_is_doubt_about_the_delay():
     assert shortening == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("tool", [False, True])
+@pytest.mark.parametrize("tool", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_sag_on_the_way_is_not_taken_for_delay(armpi, measured_armpi, tool):
     still = replace(measured_armpi.settling, scatter=(5e-4,) * 4)
     real = replace(

@@ -209,7 +209,10 @@ NOT_TOLD = "the runs do not tell it from what such robots differ by"
 
 @pytest.mark.parametrize(
     ("shift", "turn_deg", "away"),
-    [((0.003, -0.004, 0.0), 0.0, 5.0), ((0.0, 0.0, 0.0), 2.0, 8.0)],
+    [
+        pytest.param((0.003, -0.004, 0.0), 0.0, 5.0, marks=pytest.mark.slow),
+        ((0.0, 0.0, 0.0), 2.0, 8.0),
+    ],
 )
 def test_a_sensor_that_stands_elsewhere_is_told(armpi, shift, turn_deg, away):
     """By 5 mm, or turned by 2 degrees about y, which moves this tool by about 8 mm."""

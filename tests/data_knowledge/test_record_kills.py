@@ -25,7 +25,7 @@ def store(place):
     return ft.open_store(place.url, create=True)
 
 
-@pytest.fixture(params=[5, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.fixture(params=[2, pytest.param(100, marks=pytest.mark.slow)])
 def delays(request):
     """Random instants of kills, in times that the first call took."""
     return np.random.default_rng(7).uniform(0.0, LATEST, request.param)

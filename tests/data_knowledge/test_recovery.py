@@ -18,7 +18,7 @@ from failuretwin.digital_model.calibrated_robot import load_calibration
 
 FROM_ZERO = np.linspace(0.0, 10.0, 1000)
 FROM_FIRST_STEP = np.arange(1, 1001) * 0.01
-BASES = [FROM_ZERO, FROM_FIRST_STEP]
+SHORT = FROM_ZERO[:400]
 
 
 def path_error(movements, desired, time, robot):
@@ -33,15 +33,15 @@ def names_of(desired):
 
 @pytest.fixture(scope="module")
 def sample(data):
-    """Desired paths of every third of the 90 published runs."""
+    """Desired paths of every ninth of the 90 published runs."""
     cells = scipy.io.loadmat(data / "processed_samples" / "cell_array_20241003.mat")["X_test_array"]
-    return np.stack([cell[:, :3] for cell in cells[0][::3]])
+    return np.stack([cell[:, :3] for cell in cells[0][::9]])
 
 
 @pytest.fixture(scope="module")
 def truth(data):
     folder = data / "real_robot_b_20241003"
-    return read_runs(folder, options=ReadOptions("published")).isel(run=slice(None, None, 3))
+    return read_runs(folder, options=ReadOptions("published")).isel(run=slice(None, None, 9))
 
 
 @pytest.fixture(scope="module")
@@ -58,11 +58,11 @@ def simulated(armpi):
     plan = Plan(
         armpi,
         [Hypothesis.parse("healthy", armpi.motor_names)],
-        6,
+        3,
         seed=3,
         imperfections=load_calibration(None, armpi).imperfections,
     )
-    return simulate_runs(plan, range(6)).movements
+    return simulate_runs(plan, range(3)).movements
 
 
 def movements(armpi, counts, start, ramp=0.8):
@@ -91,7 +91,7 @@ def settles(start, ramp, end):
 
 
 def test_published_runs_come_back_exactly(sample, recovered, armpi):
-    assert sample.shape == (30, 1000, 3)
+    assert sample.shape == (10, 1000, 3)
     assert path_error(recovered, sample, FROM_ZERO, armpi).max() <= 1e-12
 
 
@@ -103,7 +103,7 @@ def test_recovered_movements_are_those_of_the_raw_logs(recovered, truth):
     np.testing.assert_allclose(recovered.initial, truth["command"].values[:, 0], atol=1e-9)
 
     whole = seen & settles(start, ramp, FROM_ZERO[-1])
-    assert 133 < whole.sum() < 150
+    assert 40 < whole.sum() <= 50
     np.testing.assert_allclose(recovered.target[whole], truth["target"].values[whole], atol=1e-9)
     moved = np.abs(recovered.target - recovered.origin()) > 1e-6
     np.testing.assert_allclose(
@@ -117,8 +117,8 @@ def test_targets_of_cut_off_ramps_are_whole_units_too(recovered, armpi):
     np.testing.assert_allclose(counts, counts.round(), atol=1e-6)
 
 
-@pytest.mark.parametrize("time", BASES, ids=["from_zero", "from_first_step"])
-def test_simulated_runs_come_back_on_both_time_bases(simulated, armpi, twin, time):
+def test_simulated_runs_come_back_on_the_other_time_base(simulated, armpi, twin):
+    time = FROM_FIRST_STEP
     desired = twin.path(simulated.reference(time))
     grid, found = recover_movements(desired, armpi, names=names_of(desired))
     np.testing.assert_array_equal(grid, time)
@@ -131,9 +131,9 @@ def test_simulated_runs_come_back_on_both_time_bases(simulated, armpi, twin, tim
 
 
 def test_the_wrong_time_base_leaves_a_residual(simulated, armpi, twin):
-    desired = twin.path(simulated.reference(FROM_ZERO))
+    desired = twin.path(simulated.reference(FROM_ZERO[:300]))[:1]
     with pytest.raises(InputError, match="start and durations of the published kind"):
-        on_known_grid(desired, armpi, names=names_of(desired), time=FROM_FIRST_STEP)
+        on_known_grid(desired, armpi, names=names_of(desired), time=FROM_FIRST_STEP[:300])
 
 
 def test_time_bases_are_the_published_ones():
@@ -142,22 +142,24 @@ def test_time_bases_are_the_published_ones():
     np.testing.assert_array_equal(second, FROM_ZERO)
 
 
-@pytest.mark.parametrize("kind", ["noise", "offset", "glitch", "bump"])
+@pytest.mark.parametrize(
+    "kind", ["noise", pytest.param("offset", marks=pytest.mark.slow), "glitch", "bump"]
+)
 def test_a_spoilt_path_is_refused_by_name(simulated, armpi, twin, kind):
-    desired = twin.path(simulated.reference(FROM_ZERO))[:2]
-    spoilt = np.zeros((1000, 3))
+    desired = twin.path(simulated.reference(SHORT))[:2]
+    spoilt = np.zeros((400, 3))
     if kind == "noise":
-        spoilt = 1e-3 * np.random.default_rng(0).standard_normal((1000, 3))
+        spoilt = 1e-3 * np.random.default_rng(0).standard_normal((400, 3))
     elif kind == "offset":
         spoilt[:, 0] = 1e-3
     elif kind == "glitch":
         spoilt[150, 2] = 1e-3
     else:
-        ramp = FROM_ZERO[np.abs(FROM_ZERO - simulated.start[1, 1] - 0.3) < 0.1]
-        spoilt[np.isin(FROM_ZERO, ramp), 1] = 1e-3
+        ramp = SHORT[np.abs(SHORT - simulated.start[1, 1] - 0.3) < 0.1]
+        spoilt[np.isin(SHORT, ramp), 1] = 1e-3
     desired[1] += spoilt
     with pytest.raises(InputError, match="run 'run_1'") as caught:
-        on_known_grid(desired, armpi, names=names_of(desired))
+        on_known_grid(desired, armpi, names=names_of(desired), time=SHORT)
     assert "holds its commands" in str(caught.value)
 
 
@@ -191,7 +193,7 @@ def test_motors_that_stay_have_no_duration(armpi, twin):
 
 def test_a_run_without_movements_rests(armpi, twin):
     wanted = movements(armpi, [[450, 600, 400, 450]], [])
-    found = recover_one(armpi, twin, wanted)
+    found = recover_one(armpi, twin, wanted, SHORT)
     assert found.start.shape == (1, 0)
     np.testing.assert_allclose(found.initial, wanted.initial, atol=1e-9)
 
@@ -231,10 +233,9 @@ def test_a_start_outside_the_movements_range_is_found(armpi, twin):
 
 
 def test_shorter_records_and_other_numbers_of_runs_work(armpi, twin, simulated):
-    time = FROM_ZERO[:400]
-    desired = twin.path(simulated.reference(time))[:2]
-    found = on_known_grid(desired, armpi, names=["a", "b"], time=time)
-    assert path_error(found, desired, time, armpi).max() <= 1e-9
+    desired = twin.path(simulated.reference(SHORT))[:2]
+    found = on_known_grid(desired, armpi, names=["a", "b"], time=SHORT)
+    assert path_error(found, desired, SHORT, armpi).max() <= 1e-9
 
 
 def turned(robot):
@@ -267,9 +268,9 @@ def physical(robot):
 @pytest.mark.parametrize("change", [turned, physical])
 def test_the_search_follows_the_chain(armpi, simulated, change):
     robot = change(armpi)
-    desired = DigitalTwin(robot).path(simulated.reference(FROM_ZERO))[:2]
-    found = on_known_grid(desired, robot, names=["a", "b"])
-    assert path_error(found, desired, FROM_ZERO, robot).max() <= 1e-12
+    desired = DigitalTwin(robot).path(simulated.reference(SHORT))[:2]
+    found = on_known_grid(desired, robot, names=["a", "b"], time=SHORT)
+    assert path_error(found, desired, SHORT, robot).max() <= 1e-12
 
 
 def test_fit_of_a_ramp_finds_all_that_is_free(twin):
@@ -288,11 +289,12 @@ def test_fit_of_a_ramp_finds_all_that_is_free(twin):
 
 def test_another_kind_of_arm_comes_back_exactly_too(armpi, simulated):
     robot = skewed(armpi)
-    desired = DigitalTwin(robot).path(simulated.reference(FROM_ZERO))[:3]
-    found = on_known_grid(desired, robot, names=names_of(desired))
-    assert path_error(found, desired, FROM_ZERO, robot).max() <= 1e-9
-    whole = settles(simulated.start[:3], simulated.ramp_duration[:3], FROM_ZERO[-1])
-    np.testing.assert_allclose(found.target[whole], simulated.target[:3][whole], atol=1e-9)
+    desired = DigitalTwin(robot).path(simulated.reference(SHORT))[:2]
+    found = on_known_grid(desired, robot, names=names_of(desired), time=SHORT)
+    assert path_error(found, desired, SHORT, robot).max() <= 1e-9
+    seen = found.start.shape[1]
+    whole = settles(simulated.start[:2, :seen], simulated.ramp_duration[:2, :seen], SHORT[-1])
+    np.testing.assert_allclose(found.target[whole], simulated.target[:2, :seen][whole], atol=1e-9)
 
 
 def test_a_robot_without_servo_units_is_refused(armpi, simulated):
@@ -314,7 +316,7 @@ def between_units(simulated):
 
 
 def test_targets_between_units_are_refused(armpi, twin, between_units):
-    desired = twin.path(between_units.reference(FROM_ZERO))
+    desired = twin.path(between_units.reference(SHORT))
     names = names_of(desired)
     with pytest.raises(InputError, match=r"run 'run_0'.*holds its commands"):
-        on_known_grid(desired, armpi, names=names)
+        on_known_grid(desired, armpi, names=names, time=SHORT)

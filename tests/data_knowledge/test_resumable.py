@@ -17,7 +17,7 @@ import xarray as xr
 from executed import command_line
 from failuretwin import read_runs
 from failuretwin.core.errors import InputError, OutputError
-from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge import pieces
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.pieces import versions
@@ -26,23 +26,18 @@ from failuretwin.data_knowledge.store import load_run_set, save_run_set, sole_wr
 from failuretwin.data_knowledge.workers import ONE_PROCESS
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
-RUNS_PER_CLASS = 2
+HYPOTHESES = ("healthy", "motor_1:stuck", "motor_2:steady_state_error")
+RUNS_PER_CLASS = 3
 PIECE = 4
-PIECES = 5
-"""18 runs in pieces of four."""
+PIECES = 3
+"""9 runs in pieces of four."""
 MAKE = UnfinishedRunSet.make
-
-
-@pytest.fixture(scope="module", params=["none", "armpi_fpv"])
-def plan(request, armpi):
-    known = load_calibration(request.param, armpi).imperfections
-    return Plan(armpi, paper_hypotheses(armpi.motor_names), RUNS_PER_CLASS, 5, known)
 
 
 @pytest.fixture(scope="module")
 def imperfect(armpi):
     known = load_calibration("armpi_fpv", armpi).imperfections
-    return Plan(armpi, paper_hypotheses(armpi.motor_names), RUNS_PER_CLASS, 5, known)
+    return Plan(armpi, HYPOTHESES, RUNS_PER_CLASS, 5, known)
 
 
 @pytest.fixture(scope="module")
@@ -51,11 +46,17 @@ def in_memory(imperfect):
 
 
 @pytest.fixture(scope="module")
-def at_once(imperfect, tmp_path_factory):
-    """Files of the run set that nothing interrupted."""
+def whole(imperfect, tmp_path_factory):
+    """The run set that nothing interrupted."""
     path = tmp_path_factory.mktemp("whole") / "whole.zarr"
     produce(imperfect, path, chunk_runs=PIECE)
-    return contents(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def at_once(whole):
+    """Its files."""
+    return contents(whole)
 
 
 def contents(folder):
@@ -96,14 +97,13 @@ def counting(monkeypatch):
     return made
 
 
-@pytest.mark.parametrize("chunk_runs", [1, PIECE, 100])
+@pytest.mark.parametrize("chunk_runs", [1, 100])
 def test_what_is_made_piece_by_piece_is_what_is_made_in_memory(
     tmp_path, imperfect, in_memory, chunk_runs
 ):
     produce(imperfect, tmp_path / "runs.zarr", chunk_runs=chunk_runs)
-    whole = in_memory
-    xr.testing.assert_identical(load_run_set(tmp_path / "runs.zarr"), whole)
-    save_run_set(whole, tmp_path / "whole.zarr")
+    xr.testing.assert_identical(load_run_set(tmp_path / "runs.zarr"), in_memory)
+    save_run_set(in_memory, tmp_path / "whole.zarr")
     with (
         xr.open_zarr(tmp_path / "runs.zarr", chunks=None) as made,
         xr.open_zarr(tmp_path / "whole.zarr", chunks=None) as stored,
@@ -119,7 +119,7 @@ def test_netcdf_holds_the_same(tmp_path, imperfect, in_memory):
     done = []
     produce(imperfect, tmp_path / "runs.nc", on_progress=done.append)
     xr.testing.assert_identical(load_run_set(tmp_path / "runs.nc"), in_memory)
-    assert done == [18]
+    assert done == [9]
 
 
 def test_netcdf_beyond_memory_is_refused_at_once(tmp_path, imperfect):
@@ -129,44 +129,41 @@ def test_netcdf_beyond_memory_is_refused_at_once(tmp_path, imperfect):
     assert listing(tmp_path) == []
 
 
-def test_manifest_says_what_was_made(tmp_path, imperfect):
-    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
-    manifest = json.loads((tmp_path / "runs.zarr" / "manifest.json").read_text())
-    assert (manifest["runs"], manifest["runs_per_chunk"]) == (18, PIECE)
+def test_manifest_says_what_was_made(whole):
+    manifest = json.loads((whole / "manifest.json").read_text())
+    assert (manifest["runs"], manifest["runs_per_chunk"]) == (9, PIECE)
     assert manifest["versions"]["numpy"] == np.__version__
     assert manifest["plan"]["seed"] == 5
     assert manifest["plan"]["imperfections"]["name"] == "armpi_fpv"
     assert manifest["plan"]["hypotheses"][1]["faults"][0]["motor"] == "motor_1"
 
 
-def test_manifest_holds_the_hash_of_the_data(tmp_path, imperfect):
+def test_manifest_holds_the_hash_of_the_data(whole):
     """The hash as its documentation defines it, from nothing but the files."""
-    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
     pieces = []
     for piece in range(PIECES):
         total = hashlib.sha256()
-        for file in sorted((tmp_path / "runs.zarr").glob("*/c.*"), key=str):
+        for file in sorted(whole.glob("*/c.*"), key=str):
             name = f"{file.parent.name}/{file.name}"
             if file.name.split(".")[1] == str(piece):
                 data = file.read_bytes()
                 total.update(name.encode() + b"\0" + str(len(data)).encode() + b"\0" + data)
         pieces.append(total.hexdigest())
-    manifest = json.loads((tmp_path / "runs.zarr" / "manifest.json").read_text())
+    manifest = json.loads((whole / "manifest.json").read_text())
     assert manifest["content"] == hashlib.sha256("".join(pieces).encode()).hexdigest()
 
 
-def test_work_that_was_interrupted_goes_on(monkeypatch, tmp_path, plan):
-    produce(plan, tmp_path / "whole.zarr", chunk_runs=PIECE)
-    (told,) = cut_short(plan, tmp_path / "runs.zarr", 3, monkeypatch)
-    assert told.startswith("12 of 18 runs are kept in ")
+def test_work_that_was_interrupted_goes_on(monkeypatch, tmp_path, imperfect, in_memory, at_once):
+    (told,) = cut_short(imperfect, tmp_path / "runs.zarr", 2, monkeypatch)
+    assert told.startswith("8 of 9 runs are kept in ")
     made, done, told = counting(monkeypatch), [], []
-    produce(plan, tmp_path / "runs.zarr", ONE_PROCESS, done.append, told.append, PIECE)
-    assert made == [3, 4]
-    assert told == ["continuing: 12 of 18 runs were there"]
-    assert done == [12, 4, 2]
-    xr.testing.assert_identical(load_run_set(tmp_path / "runs.zarr"), simulate(plan))
-    assert contents(tmp_path / "runs.zarr") == contents(tmp_path / "whole.zarr")
-    assert listing(tmp_path) == ["runs.zarr", "whole.zarr"]
+    produce(imperfect, tmp_path / "runs.zarr", ONE_PROCESS, done.append, told.append, PIECE)
+    assert made == [2]
+    assert told == ["continuing: 8 of 9 runs were there"]
+    assert done == [8, 1]
+    xr.testing.assert_identical(load_run_set(tmp_path / "runs.zarr"), in_memory)
+    assert contents(tmp_path / "runs.zarr") == at_once
+    assert listing(tmp_path) == ["runs.zarr"]
 
 
 def test_unfinished_work_cannot_be_read(monkeypatch, tmp_path, imperfect):
@@ -182,20 +179,20 @@ def test_unfinished_work_cannot_be_read(monkeypatch, tmp_path, imperfect):
 def test_pieces_that_are_not_what_was_written_are_made_again(
     monkeypatch, tmp_path, imperfect, at_once
 ):
-    cut_short(imperfect, tmp_path / "runs.zarr", 4, monkeypatch)
+    cut_short(imperfect, tmp_path / "runs.zarr", 2, monkeypatch)
     (partial,) = tmp_path.glob(".*.partial")
     (partial / "store" / "fault" / "c.0").unlink()
-    torn = partial / "store" / "command" / "c.2.0.0"
+    torn = partial / "store" / "command" / "c.1.0.0"
     torn.write_bytes(torn.read_bytes()[:100])
     made = counting(monkeypatch)
     produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
-    assert made == [0, 2, 4]
+    assert made == [0, 1, 2]
     assert contents(tmp_path / "runs.zarr") == at_once
 
 
 @pytest.mark.parametrize("change", [{"seed": 6}, {"runs_per_class": 1}])
 def test_another_plan_starts_over(monkeypatch, tmp_path, imperfect, change):
-    cut_short(imperfect, tmp_path / "runs.zarr", 2, monkeypatch)
+    cut_short(imperfect, tmp_path / "runs.zarr", 1, monkeypatch)
     made, told = counting(monkeypatch), []
     other = replace(imperfect, **change)
     produce(other, tmp_path / "runs.zarr", tell=told.append, chunk_runs=PIECE)
@@ -205,11 +202,11 @@ def test_another_plan_starts_over(monkeypatch, tmp_path, imperfect, change):
 
 
 def test_other_versions_start_over(monkeypatch, tmp_path, imperfect):
-    cut_short(imperfect, tmp_path / "runs.zarr", 2, monkeypatch)
+    cut_short(imperfect, tmp_path / "runs.zarr", 1, monkeypatch)
     made = counting(monkeypatch)
     monkeypatch.setattr(pieces, "__version__", "0.0.0")
     produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
-    assert made == [0, 1, 2, 3, 4]
+    assert made == [0, 1, 2]
 
 
 @pytest.fixture
@@ -248,13 +245,13 @@ def test_a_kill_between_the_two_renames_is_mended_by_the_same_command(
 def test_what_a_kill_left_half_written_is_no_part_of_the_run_set(
     monkeypatch, tmp_path, imperfect, at_once
 ):
-    cut_short(imperfect, tmp_path / "runs.zarr", 2, monkeypatch)
+    cut_short(imperfect, tmp_path / "runs.zarr", 1, monkeypatch)
     (partial,) = tmp_path.glob(".*.partial")
-    (partial / "store" / "command" / "c.2.0.0123.partial").write_bytes(b"half")
-    (partial / "done" / "2").write_bytes(b"")
+    (partial / "store" / "command" / "c.1.0.0123.partial").write_bytes(b"half")
+    (partial / "done" / "1").write_bytes(b"")
     made = counting(monkeypatch)
     produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
-    assert made == [2, 3, 4]
+    assert made == [1, 2]
     assert contents(tmp_path / "runs.zarr") == at_once
 
 
@@ -263,13 +260,13 @@ def test_a_link_stays_a_link(tmp_path, imperfect):
     (tmp_path / "runs.zarr").symlink_to(tmp_path / "disk" / "runs.zarr")
     produce(imperfect, tmp_path / "runs.zarr", chunk_runs=100)
     assert (tmp_path / "runs.zarr").is_symlink()
-    assert load_run_set(tmp_path / "runs.zarr").sizes["run"] == 18
+    assert load_run_set(tmp_path / "runs.zarr").sizes["run"] == 9
 
 
 def test_full_disk_keeps_what_is_done(monkeypatch, imperfect, old):
     before = contents(old)
-    (told,) = cut_short(imperfect, old, 3, monkeypatch, OSError)
-    assert told.startswith("12 of 18 runs are kept in ")
+    (told,) = cut_short(imperfect, old, 2, monkeypatch, OSError)
+    assert told.startswith("8 of 9 runs are kept in ")
     assert contents(old) == before
 
 
@@ -360,22 +357,21 @@ KILL = """
 import sys
 from pathlib import Path
 from failuretwin import load_robot
-from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan
 from failuretwin.data_knowledge.resumable import produce
 from failuretwin.digital_model.calibrated_robot import load_calibration
 robot = load_robot("armpi_fpv")
 known = load_calibration("armpi_fpv", robot).imperfections
-plan = Plan(robot, paper_hypotheses(robot.motor_names), 6, 5, known)
+plan = Plan(robot, ["healthy"], 40, 5, known)
 produce(plan, Path(sys.argv[1]), chunk_runs=4)
 """
 
 
 def test_killed_process_loses_at_most_the_piece_in_hand(monkeypatch, tmp_path, imperfect):
-    plan = replace(imperfect, runs_per_class=6)
+    plan = replace(imperfect, hypotheses=[Hypothesis()], runs_per_class=40)
     path = tmp_path / "runs.zarr"
     with command_line().begin(path, code=KILL) as process:
-        while len(list(tmp_path.glob(".runs.zarr.*.partial/done/*"))) < 5:
+        while len(list(tmp_path.glob(".runs.zarr.*.partial/done/*"))) < 2:
             assert process.poll() is None
             time.sleep(0.005)
         process.send_signal(signal.SIGKILL)
@@ -383,7 +379,7 @@ def test_killed_process_loses_at_most_the_piece_in_hand(monkeypatch, tmp_path, i
     there = len(list(tmp_path.glob(".runs.zarr.*.partial/done/*")))
     made = counting(monkeypatch)
     produce(plan, path, chunk_runs=PIECE)
-    assert len(made) == 14 - there
+    assert len(made) == 10 - there
     produce(plan, tmp_path / "whole.zarr", chunk_runs=PIECE)
     assert contents(path) == contents(tmp_path / "whole.zarr")
     assert listing(tmp_path) == ["runs.zarr", "whole.zarr"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
@@ -89,6 +89,7 @@ def test_readings_are_where_lines_meet(noise_m, gap, held):
     assert found.assumed.any() == (noise_m == 0.0)
 
 
+@settings(max_examples=30)
 @given(first=st.integers(0, 9), begin=st.floats(0.5, 6.0), lasts=st.floats(0.5, 2.5))
 def test_lines_across_a_gap_are_no_evidence(first, begin, lasts):
     """Settled points, what cannot be used and what is remarked, as with the gap left open."""

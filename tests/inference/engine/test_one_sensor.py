@@ -40,6 +40,7 @@ def called_faulty(diagnoses):
     return sum(d.diagnosis != "healthy" for d in diagnoses)
 
 
+@pytest.mark.slow
 def test_a_noisy_sensor_is_found_by_its_runs_together(noisy):
     diagnoser = ft.BayesDiagnoser("armpi_fpv")
     alone = [diagnoser.diagnose(noisy.isel(run=[i]))[0] for i in range(RUNS)]
