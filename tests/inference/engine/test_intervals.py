@@ -44,7 +44,7 @@ def so101():
 
 @pytest.fixture(scope="module")
 def stuck(so101):
-    return judged(*so101, "stuck", 8, onset_s=(0.3, 6.0))
+    return judged(*so101, "stuck", 12, onset_s=(0.3, 6.0))
 
 
 def test_held_angles_of_an_arm_of_a_class_lie_in_their_intervals(stuck):
@@ -58,13 +58,13 @@ def test_onsets_of_an_arm_of_a_class_lie_in_their_intervals(stuck):
 def test_a_motor_that_was_stuck_before_the_run_is_held_where_its_own_zero_puts_it():
     """What is known of an arm of a class is not where it settles, but where such arms do."""
     known = calibrated(load_robot("panda"))
-    found, runs = judged(known.imperfections, known.robot, "stuck", 5, onset_s=(0.0, 0.0))
+    found, runs = judged(known.imperfections, known.robot, "stuck", 12, onset_s=(0.0, 0.0))
     assert share_inside(found, runs, "magnitude_90", "magnitude") > 0.8
     assert share_inside(found, runs, "onset_90", "onset") > 0.8
 
 
 def test_sizes_of_errors_of_an_arm_of_a_class_lie_in_their_intervals(so101):
-    found, runs = judged(*so101, "steady_state_error", 5)
+    found, runs = judged(*so101, "steady_state_error", 12)
     assert share_inside(found, runs, "magnitude_90", "magnitude") > 0.65
 
 
@@ -74,7 +74,7 @@ def test_sizes_are_as_fine_as_what_is_seen(so101):
     still = (0.0,) * 5
     exact = replace(known.settling, friction=still, compliance=still, scatter=(1e-4,) * 5)
     precise = replace(known, settling=exact, variation=None, of_class=False)
-    found, runs = judged(precise, robot, "steady_state_error", 2, magnitude=(0.08, 0.12))
+    found, runs = judged(precise, robot, "steady_state_error", 3, magnitude=(0.08, 0.12))
     for diagnosis, run in found:
         truth = float(runs["magnitude"].values[run])
         low, high = diagnosis.magnitude_90

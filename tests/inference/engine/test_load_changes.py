@@ -105,7 +105,7 @@ def test_without_changes_there_is_one_row(scene):
 
 def test_faults_stay_found(armpi, picked_up):
     known = calibrated("armpi_fpv").imperfections
-    faulty = simulate(Plan(armpi, paper_hypotheses(armpi.motor_names)[1:], 1, 2, known))
+    faulty = simulate(Plan(armpi, paper_hypotheses(armpi.motor_names)[1:], 3, 2, known))
     right = [
         sum(
             d.diagnosis == d.truth

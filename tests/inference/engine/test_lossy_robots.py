@@ -39,10 +39,7 @@ def probability(log_joint):
     return np.exp(log_joint - log_sum(log_joint, axis=1)[:, None])
 
 
-@pytest.mark.parametrize(
-    ("name", "movements"),
-    [("armpi_fpv", None), pytest.param("ur5e", ENDLESS, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize(("name", "movements"), [("armpi_fpv", None), ("ur5e", ENDLESS)])
 def test_shares_of_outcomes_say_what_other_weights_say(name, movements):
     """At rest and on the way, with lost commands and without, for every likely hypothesis."""
     robot, share = load_robot(name), 0.15
