@@ -14,10 +14,11 @@ pytest_collect_file = Sybil(
     teardown=teardown,
 ).pytest()
 LONGER = ("calibrate.md", "live.md")
-"""Pages that learn from many runs, or watch for minutes: commands have quick tests of their own."""
+"""Pages that learn from many runs, or watch for minutes."""
 
 
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Leave out the longer pages by default."""
     for item in items:
         if item.path.parent.name == "tutorials" and item.path.name in LONGER:
             item.add_marker(pytest.mark.slow)

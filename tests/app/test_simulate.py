@@ -29,7 +29,7 @@ def made_by_one(failuretwin, tmp_path_factory):
     return path
 
 
-@pytest.mark.slow  # pieces of `--workers 2` are judged in test_plugin.py too
+@pytest.mark.slow
 def test_two_workers_write_the_same_bytes(failuretwin, tmp_path, made_by_one):
     answer = failuretwin(*COMMAND, tmp_path / "two.zarr", "--workers", 2)
     assert (answer.returncode, remarks(answer.stderr)) == (0, "")
