@@ -100,6 +100,7 @@ def test_a_notebook_runs(name, tmp_path, monkeypatch):
     assert any("sure" in out.get("text", "") for out in printed)
 
 
+@pytest.mark.slow  # as `make docs` does, which builds it for every change
 def test_the_site_builds_without_warnings(tmp_path):
     words = ["-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "docs", str(tmp_path)]
     done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True)

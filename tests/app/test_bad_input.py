@@ -190,31 +190,37 @@ def test_distributions_of_faults_that_cannot_be_used(refused, tmp_path, text, wo
     assert words in message
 
 
+@pytest.fixture(scope="module")
+def one_run(simulated, tmp_path_factory):
+    """One of the simulated runs, with the two hypotheses that are weighed."""
+    path = tmp_path_factory.mktemp("one") / "run.nc"
+    save_run_set(load_run_set(simulated).isel(run=[0]), path)
+    return path, "--hypotheses", "healthy,motor_1:stuck"
+
+
 OUTPUTS = pytest.mark.parametrize(
     ("option", "name"), [("--json", "x.jsonl"), ("--csv", "x.csv"), ("--report", "pictures")]
 )
 
 
 @OUTPUTS
-def test_results_that_go_below_a_file(refused, tmp_path, simulated, option, name):
+def test_results_that_go_below_a_file(refused, tmp_path, one_run, option, name):
     (tmp_path / "file").write_text("mine")
-    assert f"file/{name}" in refused("diagnose", simulated, option, f"file/{name}")
+    assert f"file/{name}" in refused("diagnose", *one_run, option, f"file/{name}")
     assert (tmp_path / "file").read_text() == "mine"
 
 
 @pytest.mark.parametrize(("option", "name"), [("--json", "x.jsonl"), ("--csv", "x.csv")])
-def test_results_that_go_to_a_missing_folder(refused, simulated, option, name):
-    message = refused("diagnose", simulated, option, f"nowhere/{name}")
+def test_results_that_go_to_a_missing_folder(refused, one_run, option, name):
+    message = refused("diagnose", *one_run, option, f"nowhere/{name}")
     assert "folder nowhere does not exist" in message
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="permissions do not hold back root")
 @OUTPUTS
-def test_results_that_go_to_a_folder_that_is_not_writable(
-    refused, tmp_path, simulated, option, name
-):
+def test_results_that_go_to_a_folder_that_is_not_writable(refused, tmp_path, one_run, option, name):
     (tmp_path / "locked").mkdir(mode=0o500)
-    assert "locked" in refused("diagnose", simulated, option, f"locked/{name}")
+    assert "locked" in refused("diagnose", *one_run, option, f"locked/{name}")
 
 
 @pytest.mark.parametrize("suffix", [".nc", ".zarr"])
@@ -234,8 +240,8 @@ def test_full_disk_keeps_the_old_run_set(refused, tmp_path, simulated, suffix):
 
 
 @OUTPUTS
-def test_full_disk_while_writing_results(refused, simulated, option, name):
-    message = refused("diagnose", simulated, option, name, disk_full=True)
+def test_full_disk_while_writing_results(refused, one_run, option, name):
+    message = refused("diagnose", *one_run, option, name, disk_full=True)
     assert name in message
     assert "could not be written (File too large)" in message
 

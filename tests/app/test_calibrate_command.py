@@ -119,13 +119,13 @@ def test_diagnose_uses_it(learned, failuretwin, data):
 def test_a_faulty_session_among_healthy_ones_is_left_out(failuretwin, data, armpi, tmp_path):
     labels = ("label_0", "label_1", "label_2", "label_6")
     logs = [data / "real_robot_b_20241003" / label for label in labels]
-    every_other = read_runs(logs, armpi, ReadOptions()).isel(run=slice(None, None, 2))
-    save_run_set(every_other, tmp_path / "logs.nc")
+    some = read_runs(logs, armpi, ReadOptions()).isel(run=slice(None, None, 4))
+    save_run_set(some, tmp_path / "logs.nc")
     answer = failuretwin("calibrate", "logs.nc", "--out", "twin.toml", folder=tmp_path)
     assert answer.returncode == 0, answer.stderr
     found = read_calibration(tmp_path / "twin.toml", armpi)
     runs = [entry.run for entry in found.left_out if entry.movement == 0]
-    assert len(runs) >= 4
+    assert len(runs) >= 2
     assert all("label_6" in run for run in runs)
 
 
@@ -187,13 +187,13 @@ def test_the_page_works_with_the_tool_path_alone(failuretwin, data, armpi, tmp_p
     """And without the runs that are labelled faulty."""
     logs = [data / "real_robot_b_20241003" / label for label in ("label_0", "label_3")]
     labelled = ReadOptions("measured", published_labels=True)
-    runs = read_runs(logs, armpi, labelled).drop_vars("position").isel(run=slice(None, None, 2))
+    runs = read_runs(logs, armpi, labelled).drop_vars("position").isel(run=slice(None, None, 3))
     save_run_set(runs, tmp_path / "tool.nc")
     answer = failuretwin(
         *("calibrate", "tool.nc", "--out", "twin.toml", "--report", REPORT), folder=tmp_path
     )
     assert answer.returncode == 0, answer.stderr
-    assert "5 runs: labelled motor_3:stuck" in answer.stdout
+    assert "3 runs: labelled motor_3:stuck" in answer.stdout
     assert "not checked on unseen logs" in answer.stdout
     page = Page((tmp_path / REPORT / "index.html").read_text())
     words = " ".join(page.words)
@@ -262,28 +262,31 @@ def test_what_was_left_out_is_counted(small):
 # Refusals
 
 
-@pytest.mark.parametrize("label", ["label_5", "label_7"])
-def test_faulty_sessions_are_refused(failuretwin, data, tmp_path, label, listing):
-    log = data / "real_robot_b_20241003" / label
+def test_faulty_sessions_are_refused(failuretwin, data, tmp_path, listing):
+    log = data / "real_robot_b_20241003" / "label_7"
     answer = failuretwin(
         "calibrate", log, "--out", "twin.toml", "--report", REPORT, folder=tmp_path
     )
     assert answer.returncode == 2
-    motor = f"motor_{int(label[-1]) - 4}"
-    reasons = (f"error: {motor} misses its targets", "runs look faulty")
+    reasons = ("error: motor_3 misses its targets", "runs look faulty")
     assert any(reason in answer.stderr for reason in reasons)
     assert "give logs of a healthy robot" in answer.stderr.lower()
     assert listing(tmp_path) == []
 
 
-def test_too_many_suspects_among_healthy_runs_are_refused(failuretwin, data, tmp_path, listing):
+def test_too_many_suspects_among_healthy_runs_are_refused(
+    failuretwin, data, armpi, tmp_path, listing
+):
     logs = [data / "real_robot_b_20241003" / label for label in ("label_0", "label_1", "label_7")]
-    answer = failuretwin("calibrate", *logs, "--out", "twin.toml", folder=tmp_path)
+    save_run_set(
+        read_runs(logs, armpi, ReadOptions()).isel(run=slice(None, None, 3)), tmp_path / "logs.nc"
+    )
+    answer = failuretwin("calibrate", "logs.nc", "--out", "twin.toml", folder=tmp_path)
     assert answer.returncode == 2
-    found = re.search(r"error: (\d+) of 30 runs look faulty \((.*), \.\.\.\)", answer.stderr)
-    assert 7 < int(found.group(1)) <= 10
+    found = re.search(r"error: (\d+) of 10 runs look faulty \((.*)\)", answer.stderr)
+    assert 2 <= int(found.group(1)) <= 3
     assert all("label_7" in run for run in found.group(2).split(", "))
-    assert listing(tmp_path) == []
+    assert listing(tmp_path) == ["logs.nc"]
 
 
 def test_logs_labelled_faulty_are_refused(failuretwin, data, tmp_path, listing):

@@ -318,13 +318,13 @@ def test_faults_come_as_large_as_the_file_says(failuretwin, tmp_path):
 def test_a_picture_for_every_run_and_a_page_that_says_what_the_screen_says(
     failuretwin, simulated, tmp_path
 ):
-    runs = load_run_set(simulated).isel(run=[0, 1, 2])
-    names = ["a/b", "a b", "c"]
+    runs = load_run_set(simulated).isel(run=[0, 1])
+    names = ["a/b", "a b"]
     save_run_set(runs.assign_coords(run=names), tmp_path / "runs.nc")
     answer = failuretwin("diagnose", "runs.nc", *FEW, "--report", "x/pictures", folder=tmp_path)
     assert answer.returncode == 0, answer.stderr
     pictures = list((tmp_path / "x" / "pictures").glob("*.png"))
-    assert len(pictures) == 3
+    assert len(pictures) == 2
     for picture in pictures:
         assert picture.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
         assert picture.stat().st_size > 10_000

@@ -29,13 +29,14 @@ def made_by_one(failuretwin, tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_two_workers_write_the_same_bytes(failuretwin, tmp_path, made_by_one):
     answer = failuretwin(*COMMAND, tmp_path / "two.zarr", "--workers", 2)
     assert (answer.returncode, remarks(answer.stderr)) == (0, "")
     assert contents(tmp_path / "two.zarr") == contents(made_by_one)
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_interrupted_work_is_kept_and_continued(failuretwin, begin, tmp_path, made_by_one, workers):
     arguments = [*COMMAND, tmp_path / "runs.zarr"]
     with begin(*arguments, "--workers", workers) as process:

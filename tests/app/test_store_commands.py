@@ -49,6 +49,14 @@ FEW = ("--hypotheses", "healthy,motor_3:stuck")
 
 
 @pytest.fixture(scope="module")
+def stuck_log(tmp_path_factory):
+    """The run of the sample in which motor 3 sticks."""
+    path = tmp_path_factory.mktemp("stuck") / "stuck.nc"
+    save_run_set(ft.read_runs(SAMPLE).isel(run=[1]), path)
+    return path
+
+
+@pytest.fixture(scope="module")
 def told(failuretwin, tmp_path_factory):
     """A folder with a log, its results and their store; and what was printed."""
     folder = tmp_path_factory.mktemp("told")
@@ -93,10 +101,10 @@ def test_diagnoses_are_remembered_with_their_log(run, told, filled, rows, tmp_pa
     assert rows("SELECT count(*) FROM diagnoses") == [(3,)]
 
 
-def test_a_log_that_has_changed_is_a_problem(run, store, tmp_path):
-    log = tmp_path / "log.csv"
-    log.write_bytes(SAMPLE.read_bytes())
-    run("diagnose", "log.csv", *store, *FEW)
+def test_a_log_that_has_changed_is_a_problem(run, store, stuck_log, tmp_path):
+    log = tmp_path / "log.nc"
+    log.write_bytes(stuck_log.read_bytes())
+    run("diagnose", "log.nc", *store, *FEW)
     log.write_text("another")
     assert "robots.db: 1 problem. Expected" in run("store", "check", *store, code=2)
 
@@ -135,9 +143,9 @@ def test_a_robot_is_followed_by_what_people_state(run, filled, tmp_path):
     assert "other cause" in run("query", "wrong-diagnoses", *store)
 
 
-def test_markup_in_names_is_only_text(run, store, tmp_path):
+def test_markup_in_names_is_only_text(run, store, stuck_log, tmp_path):
     name = "<b>[red]arm</b>"
-    run("diagnose", SAMPLE, *store, "--robot-name", name, *FEW)
+    run("diagnose", stuck_log, *store, "--robot-name", name, *FEW)
     run("found", name, 1, "--confirmed", "--cause", "<script>x</script>", *store)
     assert "<script>x</script>" in run("history", name, *store, "--report", "page")
     page = (tmp_path / "page" / "index.html").read_text("utf-8")
@@ -217,21 +225,21 @@ def test_a_time_in_the_future_is_refused_and_nothing_is_stored(run, store, rows)
     assert rows("SELECT * FROM robots") == []
 
 
-def test_a_full_disk_is_one_line(failuretwin, store, tmp_path):
-    answer = failuretwin("diagnose", SAMPLE, *store, *FEW, folder=tmp_path, disk_full=True)
+def test_a_full_disk_is_one_line(failuretwin, store, stuck_log, tmp_path):
+    answer = failuretwin("diagnose", stuck_log, *store, *FEW, folder=tmp_path, disk_full=True)
     assert answer.returncode == 2
     assert "robots.db: the disk is full" in answer.stderr.splitlines()[-1]
     assert failuretwin("store", "check", *store, folder=tmp_path).returncode == 0
 
 
-def test_the_store_of_the_environment_is_used(run, store, monkeypatch):
+def test_the_store_of_the_environment_is_used(run, store, stuck_log, monkeypatch):
     monkeypatch.setenv("FAILURETWIN_STORE", "robots.db")
-    assert "remembered in robots.db: 3 runs of armpi_fpv" in run("diagnose", SAMPLE, *AT, *FEW)
+    assert "remembered in robots.db: 1 run of armpi_fpv" in run("diagnose", stuck_log, *AT, *FEW)
     assert "motor 3 stuck" in run("history", "armpi_fpv")
 
 
-def test_a_store_on_a_server_works_alike(run, postgres):
+def test_a_store_on_a_server_works_alike(run, postgres, stuck_log):
     url = postgres.place().url
     run("store", "init", "--store", url)
-    run("diagnose", SAMPLE, *AT, "--store", url, *FEW)
+    run("diagnose", stuck_log, *AT, "--store", url, *FEW)
     assert "motor 3 stuck" in run("history", "armpi_fpv", "--store", url)

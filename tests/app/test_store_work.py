@@ -98,7 +98,7 @@ def test_work_of_every_command_is_in_the_history(run, store, place, calibrated, 
     (done,) = texts(store.history("arm_7"), "act")
     assert done.startswith("target (0.150, 0.000, 0.150) m: reached after")
 
-    check = run("check", "--seconds", 14, *words)
+    check = run("check", "--seconds", 8, *words)
     assert FOUND in check.stderr
     assert check.stdout.endswith(": 1 check of arm_7\n")
     assert len(texts(store.history("arm_7"), "check")) == 1
@@ -236,14 +236,14 @@ def test_an_undecided_end_clears_no_episode(file, armpi):
 
 @pytest.fixture(scope="module")
 def days(simulated, tmp_path_factory):
-    """Two logs of four runs each, recorded on two days."""
+    """Two logs of two runs each, recorded on two days."""
     folder = tmp_path_factory.mktemp("days")
     runs = load_run_set(simulated).drop_vars("fault")
     for number in range(2):
-        part = [0, 1, 0, 5] if number else [0, 0, 2, 0]
-        names = [f"day {number}, run {k}" for k in range(4)]
+        part = [0, 1] if number else [0, 2]
+        names = [f"day {number}, run {k}" for k in range(2)]
         own = runs.isel(run=part).assign_coords(run=names)
-        own["measured"] = own["measured"] + 1e-5 * np.arange(4)[:, None, None]
+        own["measured"] = own["measured"] + 1e-5 * np.arange(2)[:, None, None]
         save_run_set(own, folder / f"day_{number}.nc")
         os.utime(folder / f"day_{number}.nc", (0, 1_772_438_400 + 86_400 * number))
     return folder
@@ -286,8 +286,8 @@ def test_a_robot_in_the_store_is_followed_as_by_files(
     assert by_store.stdout == advised.stdout
     assert by_store.stdout.startswith("motor_1: fewer than 20 runs say something of its wear\n")
     again = run("diagnose", days / "day_0.nc", "--track", "--store", place.url, *NAME, *AMONG)
-    assert "0 runs learned, 8 in all, 4 known already" in again.stdout
-    assert place.sql("SELECT count(*), max(runs) FROM beliefs") == [("2", "8")]
+    assert "0 runs learned, 4 in all, 2 known already" in again.stdout
+    assert place.sql("SELECT count(*), max(runs) FROM beliefs") == [("2", "4")]
     told = run("history", "arm_7", "--store", place.url, "--report", "page").stdout
     (line,) = (line for line in told.splitlines() if line.startswith("motor_2  compliance"))
     page = (tmp_path / "page" / "index.html").read_text("utf-8")
@@ -302,10 +302,10 @@ def test_a_belief_of_another_calibration_is_not_used_and_begins_anew(run, file, 
     told = run("diagnose", days / "day_1.nc", *words, "--calibration", "armpi_fpv")
     line = "what ... holds of arm_7 is not used: it began with another calibration. Beginning anew"
     assert line.partition("... ")[2] in told.stderr
-    assert "4 runs learned, 4 in all" in told.stdout
+    assert "2 runs learned, 2 in all" in told.stdout
     back = run("diagnose", days / "day_1.nc", *words)
     assert "not used" not in back.stderr
-    assert "4 runs learned, 8 in all" in back.stdout
+    assert "2 runs learned, 4 in all" in back.stdout
 
 
 @on_sqlite
@@ -319,7 +319,7 @@ def test_a_self_calibration_begins_with_that_of_the_store(run, place, calibrated
 
 @on_postgresql
 def test_a_watch_goes_on_from_what_earlier_ones_have_learned(run, place, store):
-    words = ("watch", "emulated", "--speed", 0, "--seconds", 25, "--calibration", "generic")
+    words = ("watch", "emulated", "--speed", 0, "--seconds", 15, "--calibration", "generic")
     first = run(*words, "--track", "--store", place.url, *NAME)
     assert "0 runs of movements known before" in first.stdout
     ((known,),) = place.sql("SELECT max(runs) FROM beliefs")
@@ -342,7 +342,7 @@ def test_a_killed_watch_keeps_what_it_has_learned(run, begin, file, tmp_path):
         ((known,),) = rows.execute("SELECT sum(json_array_length(rows)) FROM beliefs")
         ((learned,),) = rows.execute("SELECT max(runs) FROM beliefs")
     assert known == 1 <= learned
-    again = run(*words, "--seconds", 25)
+    again = run(*words, "--seconds", 20)
     assert f"{learned} runs of movements known before" in again.stdout
     with closing(sqlite3.connect(file)) as rows:
         counts = [one[0] for one in rows.execute("SELECT runs FROM beliefs ORDER BY id")]

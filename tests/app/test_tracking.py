@@ -127,11 +127,11 @@ def test_advice_of_a_history(track, failuretwin, few_known, calibration, healthy
 
 def test_a_session_at_a_time_is_as_good_as_all_at_once(track, calibration, healthy, tmp_path):
     """Sessions given in one command or in several leave the same history, byte for byte."""
-    runs = load_run_set(healthy).isel(run=slice(0, 10))
-    names = [f"session_{i // 5}/{i}" for i in range(10)]
+    runs = load_run_set(healthy).isel(run=slice(0, 6))
+    names = [f"session_{i // 3}/{i}" for i in range(6)]
     runs = runs.assign_coords(run=np.array(names, dtype=object))
     parts = [tmp_path / "a.nc", tmp_path / "b.nc"]
-    for path, rows in zip(parts, (slice(0, 5), slice(5, 10)), strict=True):
+    for path, rows in zip(parts, (slice(0, 3), slice(3, 6)), strict=True):
         save_run_set(runs.isel(run=rows), path)
     history = calibration.with_suffix(".history.jsonl")
     assert track(*parts).returncode == 0
@@ -179,11 +179,11 @@ def test_runs_without_movements_do_no_harm(track, calibration, healthy, tmp_path
 def test_a_fault_is_told_and_not_learned(track, calibration, failuretwin, tmp_path):
     path = tmp_path / "stuck.nc"
     failuretwin(
-        *("simulate", "--out", path, "--hypotheses", "motor_1:stuck", "--runs-per-class", 27),
+        *("simulate", "--out", path, "--hypotheses", "motor_1:stuck", "--runs-per-class", 9),
         *("--calibration", "armpi_fpv"),
     )
     answer = track(path)
-    assert "27 runs learned" in answer.stdout
+    assert "9 runs learned" in answer.stdout
     rows = rows_of(calibration)
     change = np.abs(rows[-1]["bias"][0] - np.array(rows[0]["bias"][0]))
     assert change < 0.5 * np.array(rows[0]["bias_deviation"][0])

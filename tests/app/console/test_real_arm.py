@@ -33,7 +33,7 @@ QUIET_S = 3.0
 """Time in which a check sends an order or more [s]."""
 SCRIPTS_END = """for (let k = 0; k < 100000; k++) clearInterval(k);
 window.socket.io.reconnection(false); window.socket.disconnect();"""
-HANG = "setTimeout(() => { const end = Date.now() + 9000; while (Date.now() < end); }, 50)"
+HANG = "setTimeout(() => { const end = Date.now() + 7000; while (Date.now() < end); }, 50)"
 
 
 class Listener:
@@ -100,7 +100,7 @@ WATCHED, MOVED = pytest.param((), id="watched"), pytest.param(("--move",), id="m
 
 @pytest.mark.parametrize("person", [WATCHED, MOVED], indirect=True)
 def test_only_a_server_that_may_move_an_arm_moves_it(person, arm):
-    before = begin(person, arm, "6")
+    before = begin(person, arm, "5")
     person.sees("the check is over", "healthy")
     assert (arm.hear() > before) is person.moves
     assert ("started without --move" in person.text) is not person.moves
@@ -109,7 +109,7 @@ def test_only_a_server_that_may_move_an_arm_moves_it(person, arm):
 
 @pytest.mark.parametrize("person", [MOVED], indirect=True)
 def test_the_stop_button_works_when_the_scripts_have_ended(person, arm):
-    before = begin(person, arm, "40")
+    before = begin(person, arm, "15")
     wait_for(lambda: arm.hear() > before)
     person.browser.execute_script(SCRIPTS_END)
     person.find("//button[normalize-space()='STOP']").click()
@@ -120,7 +120,7 @@ def test_the_stop_button_works_when_the_scripts_have_ended(person, arm):
 
 @pytest.mark.parametrize("person", [MOVED], indirect=True)
 def test_an_arm_stops_by_itself_when_its_page_hangs(person, arm):
-    before = begin(person, arm, "40")
+    before = begin(person, arm, "15")
     wait_for(lambda: arm.hear() > before)
     person.browser.execute_script(HANG)
     wait_for(lambda: stands(arm))
