@@ -100,10 +100,10 @@ def test_a_robot_on_a_ros_network_is_watched(roscore, begin):
     peer = RosPeer(roscore.environment)
     topic = {"topic": "/diagnostics"}
     peer.ask(op="listen", type="diagnostic_msgs/DiagnosticArray", **topic)
-    words = ("emulate", "--speed", 5, "--fault", "motor_3:stuck@12")
+    words = ("emulate", "--speed", 5, "--fault", "motor_3:stuck@20")
     robot = begin(*words, environment=environment)
     try:
-        with begin("watch", "ros1", "--seconds", 9, environment=environment) as answer:
+        with begin("watch", "ros1", "--seconds", 14, environment=environment) as answer:
             stdout, stderr = answer.communicate()
     finally:
         robot.terminate()

@@ -33,7 +33,7 @@ QUIET_S = 3.0
 """Time in which a check sends an order or more [s]."""
 SCRIPTS_END = """for (let k = 0; k < 100000; k++) clearInterval(k);
 window.socket.io.reconnection(false); window.socket.disconnect();"""
-HANG = "setTimeout(() => { const end = Date.now() + 7000; while (Date.now() < end); }, 50)"
+HANG = "setTimeout(() => { const end = Date.now() + 9000; while (Date.now() < end); }, 50)"
 
 
 class Listener:
