@@ -303,7 +303,7 @@ def test_faulty_runs_say_of_scatter_what_healthy_ones_do(twin, armpi):
     wide = tuple(1.6 * np.array(SETTLING.scatter))
     errors = [f"motor_{k}:steady_state_error" for k in (2, 3, 4)]
     learned = []
-    for truths, each in ((["healthy"], 16), (errors, 10), (TRUTHS[1::2], 6)):
+    for truths, each in ((["healthy"], 24), (errors, 16), (TRUTHS[1::2], 12)):
         runs = runs_of(armpi, truths, each, known=known, scatter=wide)
         among = [*HEALTHY, *map(Hypothesis.parse, TRUTHS[1::2] if "stuck" in truths[0] else errors)]
         theta, *_ = judged(twin, runs, among, priors=SURE, known=known)

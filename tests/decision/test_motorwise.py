@@ -323,7 +323,7 @@ def test_onsets_are_sharpened_until_their_intervals_hold():
     edges = np.linspace(-4.0, 4.0, 81)
     middle = 0.5 * (edges[1:] + edges[:-1])
     said = Onset(edges[:-1], edges[1:], np.exp(-0.25 * middle**2)).powered(1.0)
-    held = [(float(x), said) for x in rng.standard_normal(1000)]
+    held = [(float(x), said) for x in rng.standard_normal(2000)]
     assert fitted_factor(held, narrower=True) == pytest.approx(2.0, rel=0.12)
     low, half, high = said.powered(2.0).quantiles()
     np.testing.assert_allclose((low, half, high), (-1.645, 0.0, 1.645), atol=0.02)

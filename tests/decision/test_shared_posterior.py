@@ -246,7 +246,7 @@ def test_hypotheses_reach_a_zero_that_is_far_off(twin, armpi, off_deg):
 def test_posterior_is_that_of_quadrature_over_the_scale(twin, seed):
     """A tenth of the belief: a scale that is off by 1.5 %. All else is known."""
     one = scene(twin, TRUTHS[seed], runs=1, seed=seed, doubt=None)
-    theta = np.linspace(-0.06, 0.06, 65)
+    theta = np.linspace(-0.06, 0.06, 97)
     belief = SetupPrior(
         origin_rate=0.0, turn_rate=0.0, scale_rate=0.1, all_rate=0.0, noise_rate=0.0
     )

@@ -21,8 +21,8 @@ from failuretwin.decision.fleet.partition import (
 )
 from fleet_messages import PROFILE_OF, ZERO_S, decided, envelopes, played, resolve, seconds
 
-EARLY = 3 + 3 * 24
-"""Messages of 24 s, in which both faults are found."""
+EARLY = 3 + 3 * 26
+"""Messages of 26 s, in which both faults are found."""
 
 
 def first_of(alone):
@@ -100,7 +100,7 @@ def test_messages_that_are_sent_again_are_counted_and_change_nothing(alone):
     }
     counts = partition.health()["arm_0"]["counts"]
     own = sum(
-        len(events) for second in seconds()[:24] for name, events in second if name == "arm_0"
+        len(events) for second in seconds()[:26] for name, events in second if name == "arm_0"
     )
     assert 0.9 * own < counts["doubled"] <= own
 
