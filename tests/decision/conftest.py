@@ -12,9 +12,9 @@ from failuretwin.digital_model.calibrated_robot import load_calibration
 
 @pytest.fixture(scope="session")
 def imperfect(armpi):
-    """Twenty runs of each of the paper's classes, with the imperfections of the real robot."""
+    """Eight runs of each of the paper's classes, with the imperfections of the real robot."""
     known = load_calibration("armpi_fpv", armpi).imperfections
-    return simulate(Plan(armpi, paper_hypotheses(armpi.motor_names), 20, 5, known))
+    return simulate(Plan(armpi, paper_hypotheses(armpi.motor_names), 8, 5, known))
 
 
 @pytest.fixture(scope="session")

@@ -131,7 +131,7 @@ def test_one_run_alone_is_judged_with_the_prior(twin, mixed, monkeypatch):
     """What it says itself of the robot does not count for its own hypothesis a second time."""
     monkeypatch.setattr(habits, "SCATTER_SPREAD", 1e-6)
     monkeypatch.setattr(habits, "TAIL_SPREAD", 1e-6)
-    for run in range(0, 8, 2):  # one of each truth
+    for run in (0, 2, 4):
         alone = mixed.isel(run=[run])
         theta, log_posterior, names = judged(twin, alone, FEW, SURE)
         seen = theta.posteriors[0].likelihood

@@ -57,7 +57,7 @@ def test_an_arm_without_flaws_goes_along_the_curve_that_it_is_told():
     np.testing.assert_allclose(path[seen], wanted, atol=0.006)  # a straight way is 0.2 m off
 
 
-@pytest.mark.parametrize("motion", [zigzag, curve])
+@pytest.mark.parametrize("motion", [pytest.param(zigzag, marks=pytest.mark.slow), curve])
 def test_a_motion_that_never_rests_shows_errors_that_come_while_it_lasts(motion):
     found = ft.isolability(ROBOT, motion(0), TIME, "generic", [ERROR], onset_s=3.0)
     size = found.detected[ERROR]
@@ -68,7 +68,7 @@ def test_a_motion_that_never_rests_shows_errors_that_come_while_it_lasts(motion)
 @pytest.fixture(scope="module")
 def foretold():
     """The smallest error that is found in random motions without a rest [rad]."""
-    runs = simulate(Plan(ROBOT, ["healthy"], 3, 5, USUAL, WITHOUT_REST))
+    runs = simulate(Plan(ROBOT, ["healthy"], 2, 5, USUAL, WITHOUT_REST))
     commands, time = runs["command"].values, runs["time"].values
     return ft.isolability(ROBOT, commands, time, "generic", [ERROR]).detected[ERROR]
 

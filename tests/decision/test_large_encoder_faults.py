@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin import BayesDiagnoser
+from failuretwin import BayesDiagnoser, Priors, SetupPrior
 from failuretwin.core.hypothesis import parse_hypotheses, single_faults
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.failure_behavior.modes import EncoderBias, EncoderScale
@@ -24,7 +24,8 @@ def found(twin, armpi, measured_armpi):
     )
     runs = simulate(Plan(armpi, states, 15, 1, measured_armpi, modes=LARGE))
     hypotheses = single_faults(armpi.motor_names, ("stuck", *LARGE))
-    said = BayesDiagnoser(twin, measured_armpi, hypotheses).diagnose(runs)
+    priors = Priors(setup=SetupPrior.known())
+    said = BayesDiagnoser(twin, measured_armpi, hypotheses, priors).diagnose(runs)
     return list(zip(said, runs["magnitude"].values, strict=True))
 
 

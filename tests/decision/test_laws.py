@@ -58,7 +58,7 @@ FAULT_MODELS = {
 @pytest.fixture(scope="module")
 def runs(imperfect):
     """A run of each class, of 3 to 5 movements: some end early."""
-    some = imperfect.isel(run=slice(0, 180, 20)).copy(deep=True)
+    some = imperfect.isel(run=slice(0, 72, 8)).copy(deep=True)
     for run, last in enumerate([800, 450] * 4):
         some["command"][run, last:] = some["command"].values[run, last]
         some["measured"][run, last:] = np.nan
@@ -130,8 +130,7 @@ def test_onsets_on_a_ramp_hold_the_doubt_about_the_lag_of_one_motor(likelihood):
 @pytest.mark.parametrize(
     "hypothesis",
     [*single_faults(MOTORS[1:2], MODES), UNKNOWN,
-     Hypothesis.parse("motor_2:encoder_bias+motor_3:stuck"),
-     Hypothesis.parse("motor_1:drift+motor_4:steady_state_error")],
+     Hypothesis.parse("motor_2:encoder_bias+motor_3:stuck")],
     ids=str,
 )  # fmt: skip
 def test_without_evidence_every_hypothesis_is_as_good(blind, hypothesis):

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,6 @@ from failuretwin.app.commands.learn import train as command
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.decision import training_data as stream_module
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.decision.learned.networks import (
     Standard,
@@ -18,7 +19,7 @@ from failuretwin.decision.learned.networks import (
     training,
 )
 from failuretwin.decision.training import TrainingPlan, train
-from failuretwin.decision.training_data import KINDS, widened
+from failuretwin.decision.training_data import KINDS, PopulationStream, widened
 
 CHANNELS, CLASSES = 10, 3
 ALL = pytest.mark.parametrize("name", ["lstm", "cnn", "tcn"])
@@ -35,7 +36,7 @@ def toy(runs=96, seed=0):
     return features, classes
 
 
-def learn(name, seed=0, iterations=60):
+def learn(name, seed=0, iterations=40):
     features, classes = toy()
     torch.manual_seed(seed)
     network = build_network(name, CHANNELS, CLASSES)
@@ -137,7 +138,12 @@ def test_widened_robots_differ_more(armpi):
 
 
 def test_a_network_is_trained_and_pooled_with_bayes_in_one_call(armpi, measured_armpi, monkeypatch):
-    monkeypatch.setattr(stream_module, "CHUNK_RUNS", 64)
+    """In one process."""
+
+    def made(stream):
+        return (stream.data.chunk(number, 64) for number in itertools.count())
+
+    monkeypatch.setattr(PopulationStream, "chunks", made)
     asked = tuple(h for h in paper_hypotheses(armpi.motor_names) if "error" not in str(h))
     plan = TrainingPlan(iterations=2, validation_runs=18, hypotheses=asked)
     both = train(armpi, measured_armpi, plan, with_bayes=True)

@@ -37,7 +37,7 @@ PAPER_MODES = {mode: MODES[mode] for mode in ("stuck", "steady_state_error")}
 BUNDLED = ("armpi_fpv", "so101", "ur5e", "panda")
 
 
-def test_set(robot, imperfections, per_class=4, seed=2):
+def test_set(robot, imperfections, per_class=3, seed=2):
     hypotheses = paper_hypotheses(robot.motor_names)
     return simulate(Plan(robot, hypotheses, per_class, seed, imperfections))
 
@@ -57,7 +57,7 @@ def encoder(armpi, measured_armpi):
 
 @pytest.fixture(scope="module")
 def trained(encoder, runs):
-    return MotorwiseDiagnoser(encoder, iterations=30, random_state=1).fit(runs)
+    return MotorwiseDiagnoser(encoder, iterations=12, random_state=1).fit(runs)
 
 
 def test_a_token_says_how_far_its_motor_is_off(armpi):
@@ -159,7 +159,7 @@ def test_quantiles_of_a_sum_of_normals_hold_their_share():
 def test_it_follows_the_protocol_of_scikit_learn(trained, runs):
     fresh = clone(trained)
     assert not hasattr(fresh, "network_")
-    assert fresh.get_params()["iterations"] == 30
+    assert fresh.get_params()["iterations"] == 12
     right = np.mean(trained.predict(runs) == runs["fault"].values)
     assert trained.score(runs) == pytest.approx(right)
     again = fresh.fit(runs)
@@ -245,11 +245,12 @@ def test_chunks_depend_on_seed_and_number_alone():
     robots = tuple(calibrated(name) for name in ("armpi_fpv", "ur5e"))
     first, again, other = (PopulationData(robots, PAPER_MODES, seed) for seed in (4, 4, 5))
     for number, motors in ((0, 4), (1, 5)):
-        tokens, labels = first.chunk(number, 18)
+        tokens, labels = first.chunk(number, 9)
         assert tokens.features.shape[2] == motors
-        np.testing.assert_array_equal(tokens.features, again.chunk(number, 18)[0].features)
-        np.testing.assert_array_equal(labels.size, again.chunk(number, 18)[1].size)
-        assert not np.array_equal(labels.size, other.chunk(number, 18)[1].size)
+        same_tokens, same_labels = again.chunk(number, 9)
+        np.testing.assert_array_equal(tokens.features, same_tokens.features)
+        np.testing.assert_array_equal(labels.size, same_labels.size)
+        assert not np.array_equal(labels.size, other.chunk(number, 9)[1].size)
 
 
 def test_every_run_of_every_arm_is_used_as_often_as_asked():
@@ -311,7 +312,7 @@ def test_sizes_are_widened_until_their_intervals_hold():
     """Deviations that are half of what they should be."""
     rng = np.random.default_rng(0)
     one = np.ones(1)
-    held = [(float(x), Size(one, 0.0 * one, 0.5 * one)) for x in rng.standard_normal(4000)]
+    held = [(float(x), Size(one, 0.0 * one, 0.5 * one)) for x in rng.standard_normal(2000)]
     assert fitted_factor(held, narrower=False) == pytest.approx(2.0, rel=0.08)
     assert fitted_factor(held[:5], narrower=False) == 1.0
 

@@ -16,9 +16,7 @@ PAIRS = tuple(
     Hypothesis.parse(text)
     for text in (
         "motor_1:stuck+motor_3:stuck",
-        "motor_1:steady_state_error+motor_2:stuck",
         "motor_2:encoder_bias+motor_4:stuck",
-        "motor_1:encoder_bias+motor_3:encoder_bias",
         "motor_1:drift+motor_4:steady_state_error",
     )
 )
@@ -58,9 +56,9 @@ def test_each_of_the_two_is_named(found):
         assert d.onset_90[0] <= d.onset_s <= d.onset_90[1]
 
 
-def test_a_single_fault_is_not_taken_for_two(twin, imperfect, found):
+def test_a_single_fault_is_not_taken_for_two(twin, imperfect):
     """The odds of two faults multiply; where one explains all, the second has nothing to say."""
-    rows = [20 * k for k in (1, 3, 5)]
+    rows = [8 * k for k in (1, 5)]
     both = tuple(
         Hypothesis.parse(text)
         for text in ("motor_1:stuck+motor_3:stuck", "motor_1:encoder_bias+motor_3:stuck")
@@ -98,7 +96,7 @@ def test_a_second_fault_that_cannot_show_changes_nothing(twin, imperfect, monkey
             onsets=stretches.onsets(0.5),
         )
 
-    runs = imperfect.isel(run=[5, 105])
+    runs = imperfect.isel(run=[5, 41])
     likelihood = RunLikelihood(settled_evidence(runs), BayesDiagnoser(twin).healthy_model)
     priors = Priors(onset=OnsetPrior(prior_before_run=0.5))
     single = marginal_likelihood_of(likelihood, Hypothesis.parse(f"motor_1:{one}"), priors)

@@ -10,7 +10,7 @@ import pytest
 
 from failuretwin import BayesDiagnoser, SetupPrior, load_robot
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import HEALTHY_STATE
+from failuretwin.core.hypothesis import HEALTHY_STATE, paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.decision.robot_state import robot_state
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -43,8 +43,13 @@ def runs(armpi, known):
 
 
 @pytest.fixture(scope="module")
-def as_told(twin, runs):
-    return BayesDiagnoser(twin).diagnose(runs)
+def some_faults(twin):
+    return BayesDiagnoser(twin, hypotheses=TRUTHS)
+
+
+@pytest.fixture(scope="module")
+def as_told(some_faults, runs):
+    return some_faults.diagnose(runs)
 
 
 def made(robot, words):
@@ -149,7 +154,8 @@ def test_the_prior_of_a_zero_has_a_narrow_half_and_a_wide_one(armpi):
 
 def test_a_log_that_fits_is_judged_as_if_no_set_up_was_asked(twin, runs, as_told):
     sure = Priors(setup=replace(SetupPrior(), wrong_rate=(0.0, 0.0)))
-    for one, other in zip(BayesDiagnoser(twin, priors=sure).diagnose(runs), as_told, strict=True):
+    found = BayesDiagnoser(twin, hypotheses=TRUTHS, priors=sure).diagnose(runs)
+    for one, other in zip(found, as_told, strict=True):
         assert one.posterior == pytest.approx(other.posterior, abs=1e-9)
         assert not remarks(other)
 
@@ -158,31 +164,29 @@ def test_a_log_that_fits_is_judged_as_if_no_set_up_was_asked(twin, runs, as_told
     "words",
     ["motor 2 and motor 3 are swapped", "y of the tool", "millimetres"],
 )
-def test_a_mistake_is_named_and_the_diagnosis_goes_on(twin, runs, as_told, words):
-    found = BayesDiagnoser(twin).diagnose(made(twin.robot, words).runs(runs.isel(run=[1])))
+def test_a_mistake_is_named_and_the_diagnosis_goes_on(twin, some_faults, runs, as_told, words):
+    found = some_faults.diagnose(made(twin.robot, words).runs(runs.isel(run=[1])))
     same_verdicts(found, as_told[1:2])
     assert all(words in remarks(d)[0] and "does not fit" in remarks(d)[0] for d in found)
 
 
-def test_one_run_is_enough_for_a_sense(twin, runs, as_told):
-    (found,) = BayesDiagnoser(twin).diagnose(
-        made(twin.robot, "motor 2 turns").runs(runs.isel(run=[0]))
-    )
+def test_one_run_is_enough_for_a_sense(twin, some_faults, runs, as_told):
+    (found,) = some_faults.diagnose(made(twin.robot, "motor 2 turns").runs(runs.isel(run=[0])))
     same_verdicts([found], as_told[:1])
     assert "motor 2 turns the other way" in remarks(found)[0]
 
 
-def test_two_mistakes_at_once_are_named(twin, runs, as_told):
+def test_two_mistakes_at_once_are_named(twin, some_faults, runs, as_told):
     both = made(twin.robot, "motor 2 turns").after(made(twin.robot, "motor 3 and motor 4"))
-    (found,) = BayesDiagnoser(twin).diagnose(both.runs(runs.isel(run=[0])))
+    (found,) = some_faults.diagnose(both.runs(runs.isel(run=[0])))
     same_verdicts([found], as_told[:1])
     assert "motor 2 turns" in remarks(found)[0]
     assert "motor 3 and motor 4" in remarks(found)[0]
 
 
 @pytest.mark.parametrize("late_s", [0.4, -0.3])
-def test_a_clock_that_is_apart_is_named_with_its_sign(twin, runs, as_told, late_s):
-    found = BayesDiagnoser(twin).diagnose(replace(NONE, late_s=-late_s).runs(runs))
+def test_a_clock_that_is_apart_is_named_with_its_sign(some_faults, runs, as_told, late_s):
+    found = some_faults.diagnose(replace(NONE, late_s=-late_s).runs(runs))
     told = re.search(r"clock is ([\d.]+) s (behind|ahead)", remarks(found[0])[0])
     assert told is not None
     assert float(told[1]) == pytest.approx(abs(late_s), abs=0.05)
@@ -190,13 +194,14 @@ def test_a_clock_that_is_apart_is_named_with_its_sign(twin, runs, as_told, late_
     same_verdicts(found, as_told)
 
 
-@pytest.mark.parametrize(("late_s", "told"), [(0.14, 0), (0.4, 3)])
+@pytest.mark.parametrize(("late_s", "told"), [(0.14, 0), (0.4, 2)])
 def test_an_arm_that_nobody_has_calibrated_may_trail_its_commands(late_s, told):
     """By how much is not known, so a clock that is a little behind is not blamed for it."""
     robot = load_robot("ur5e")
-    runs = simulate(Plan(robot, ["healthy"], 3, 3, NO_IMPERFECTIONS, RandomMovements(count=6)))
+    runs = simulate(Plan(robot, ["healthy"], 2, 3, NO_IMPERFECTIONS, RandomMovements(count=6)))
     late = replace(LogCorrection.none(len(robot.motors)), late_s=-late_s).runs(runs)
-    found = BayesDiagnoser(robot).diagnose(late)
+    few = paper_hypotheses(robot.motor_names)[:3]
+    found = BayesDiagnoser(robot, hypotheses=few).diagnose(late)
     assert sum("clock" in line for one in found for line in remarks(one)) == told
 
 

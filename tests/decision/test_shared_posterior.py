@@ -158,7 +158,7 @@ def test_a_noisy_sensor_is_told(twin, armpi):
 
 def test_two_faults_are_weighed_where_the_others_put_the_sensor(twin, armpi):
     both = "motor_2:stuck+motor_3:stuck"
-    names = ["healthy", "motor_2:stuck", "motor_3:stuck", both]
+    names = ["healthy", "motor_2:stuck", both]
     runs = moved(made(armpi, [both, "healthy"], seed=4, count=4), (0.01, 0.015, -0.01))
     found = BayesDiagnoser(twin, KNOWN, names).diagnose(runs)
     assert right(found)
@@ -246,7 +246,7 @@ def test_hypotheses_reach_a_zero_that_is_far_off(twin, armpi, off_deg):
 def test_posterior_is_that_of_quadrature_over_the_scale(twin, seed):
     """A tenth of the belief: a scale that is off by 1.5 %. All else is known."""
     one = scene(twin, TRUTHS[seed], runs=1, seed=seed, doubt=None)
-    theta = np.linspace(-0.075, 0.075, 121)
+    theta = np.linspace(-0.06, 0.06, 97)
     belief = SetupPrior(
         origin_rate=0.0, turn_rate=0.0, scale_rate=0.1, all_rate=0.0, noise_rate=0.0
     )

@@ -23,10 +23,10 @@ def moves(actor):
 
 
 def test_a_healthy_arm_is_left_alone(model, armpi):
-    actor = carry_out(SmallWorld(model, 1), Belief(model), task_of(armpi, 10))
-    assert reached(actor) == 10
+    actor = carry_out(SmallWorld(model, 1), Belief(model), task_of(armpi, 6))
+    assert reached(actor) == 6
     assert actor.belief.believed is None
-    assert moves(actor) <= 15
+    assert moves(actor) <= 9
 
 
 def test_a_stuck_motor_is_planned_round(model, armpi):
@@ -73,40 +73,40 @@ def test_a_repair_is_noticed_by_probing(model, armpi):
     actor = carry_out(
         world,
         Belief(model),
-        task_of(armpi, 20, 4),
+        task_of(armpi, 14, 4),
         ActingSettings(probe_every=4),
         each=repair,
     )
     assert any("taken for motor_3:stuck" in text for text in actor.said)
     assert any("let go of motor_3:stuck" in text for text in actor.said)
     assert actor.belief.believed is None
-    assert sum(result.reached for result in actor.results[-5:]) == 5
+    assert sum(result.reached for result in actor.results[-3:]) == 3
 
 
 def test_evidence_is_not_forgotten_by_the_reaction(model, armpi):
     truth = believed(armpi, 3, "stuck", 0.4, 0.4)
-    actor = carry_out(SmallWorld(model, 5, truth), Belief(model), task_of(armpi, 15, 6))
+    actor = carry_out(SmallWorld(model, 5, truth), Belief(model), task_of(armpi, 8, 6))
     said = [text for text in actor.said if "let go" in text or "given up" in text]
     assert said == []
     assert str(actor.belief.believed.fault) == "motor_4:stuck"
 
 
-@pytest.mark.parametrize("wrong", [(1, "stuck"), (3, "stuck"), (1, "steady_state_error")])
+@pytest.mark.parametrize("wrong", [(1, "stuck"), (1, "steady_state_error")])
 def test_a_wrong_belief_costs_a_healthy_arm_nothing(model, armpi, wrong):
     motor, mode = wrong
     angle = 0.5 if mode == "stuck" else np.nan
     belief = Belief(model, believed=believed(armpi, motor, mode, angle, angle))
-    actor = carry_out(SmallWorld(model, 7), belief, task_of(armpi, 8, 2))
-    assert reached(actor) == 8
-    assert moves(actor) <= 16
+    actor = carry_out(SmallWorld(model, 7), belief, task_of(armpi, 4, 2))
+    assert reached(actor) == 4
+    assert moves(actor) <= 8
 
 
 def test_the_belief_in_another_stuck_motor_is_replaced(model, armpi):
     truth = believed(armpi, 3, "stuck", 0.3, 0.3)
     belief = Belief(model, believed=believed(armpi, 1, "stuck", 0.2, 0.2))
-    actor = carry_out(SmallWorld(model, 7, truth), belief, task_of(armpi, 10, 2))
+    actor = carry_out(SmallWorld(model, 7, truth), belief, task_of(armpi, 5, 2))
     assert str(actor.belief.believed.fault) == "motor_4:stuck"
-    assert reached(actor) >= 8
+    assert reached(actor) >= 3
 
 
 def test_random_errors_are_parked_and_not_renamed_stuck(model, armpi):
@@ -122,7 +122,7 @@ def test_random_errors_are_parked_and_not_renamed_stuck(model, armpi):
 @pytest.mark.parametrize(("mode", "size"), [("encoder_bias", 0.15), ("encoder_scale", -0.35)])
 def test_constant_errors_are_taken_off_the_commands(model, armpi, mode, size):
     truth = believed(armpi, 1, mode, size)
-    task = task_of(armpi, 12, 9)
+    task = task_of(armpi, 6, 9)
     ours = carry_out(SmallWorld(model, 3, truth), Belief(model), task)
     alone = carry_out(SmallWorld(model, 3, truth), None, task)
     assert str(ours.belief.believed.fault) == f"motor_2:{mode}"
@@ -159,7 +159,7 @@ def test_a_lost_command_is_sent_again_not_corrected_twice(model, armpi):
 def test_a_drift_is_followed_and_taken_off_ahead(model, armpi):
     """What has slipped is many times what the latest movements show; the rate is what counts."""
     truth = believed(armpi, 1, "drift", 0.015)
-    task = task_of(armpi, 14, 9)
+    task = task_of(armpi, 9, 9)
     world = SmallWorld(model, 1, truth)
     ours = carry_out(world, Belief(model), task)
     alone = carry_out(SmallWorld(model, 1, truth), None, task)

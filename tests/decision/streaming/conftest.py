@@ -12,13 +12,16 @@ from failuretwin.data_knowledge.generate import simulate
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
+from failuretwin.failure_behavior.random_movements import RandomMovements
 
 
 @pytest.fixture(scope="session")
 def live_runs(armpi):
     """Eighteen runs of the paper's nine states, with gaps, glitches, late starts."""
     imperfect = load_calibration(armpi.name, armpi).imperfections
-    return simulate(Plan(armpi, paper_hypotheses(armpi.motor_names), 2, 7, imperfect))
+    return simulate(
+        Plan(armpi, paper_hypotheses(armpi.motor_names), 2, 7, imperfect, RandomMovements(count=3))
+    )
 
 
 @pytest.fixture(scope="session")

@@ -65,7 +65,7 @@ def test_a_stuck_motor_that_received_its_goal_is_named_within_a_movement(twin, r
 
 
 def test_a_motor_whose_goals_do_not_come_is_not_stuck(twin, reported):
-    samples, states = reported(15, stays_from=6, lost=True), {}
+    samples, states = reported(12, stays_from=4, lost=True), {}
     for sensing in ("tool", "tool+goals"):
         watch = watching(twin, sensing)
         told = [watch.update(*sample) for sample in samples]

@@ -125,7 +125,7 @@ def test_zeros_and_frames_are_no_faults(twin, work, wrong, words, movements):
 
 
 def test_a_motor_that_sticks_from_the_first_movement_on_is_blamed(twin, work):
-    watch = watching(twin)
+    watch = watching(twin, FAULTS[:2])
     told = answers(watch, work(11, stuck=[(1, 0, 11)]))
     assert blamed(told) == {"motor_2:stuck"}
     assert watch.set_up == ""

@@ -42,9 +42,9 @@ def delay(rows, first):
 
 
 def test_a_late_fault_is_found_as_fast_as_an_early_one(told_of_repaired, watcher, work):
-    """The movements after the onset, until it is sure, are as few after 16 as after 6."""
+    """The movements after the onset, until it is sure, are as few after 12 as after 6."""
     early = delay(rows_of(told_of_repaired), 6)
-    late = delay(rows_of(watcher.update(*s) for s in work(20, stuck=[(1, 16, 20)])), 16)
+    late = delay(rows_of(watcher.update(*s) for s in work(16, stuck=[(1, 12, 16)])), 12)
     assert late < early + 1.5 * PERIOD_S
     assert max(late, early) < 4 * PERIOD_S
 
@@ -58,15 +58,15 @@ def test_a_repaired_robot_becomes_healthy_again(told_of_repaired):
 
 
 def test_the_onset_of_an_old_fault_stands(watcher, work):
-    diagnoser, samples = watcher, work(11, stuck=[(1, 4, 11)])
+    diagnoser, samples = watcher, work(8, stuck=[(1, 3, 8)])
     for sample in samples:
         answer = diagnoser.update(*sample)
     assert answer.diagnosis.diagnosis == "motor_2:stuck"
     low, high = answer.diagnosis.onset_90
-    onset = 0.5 + PERIOD_S * 4
+    onset = 0.5 + PERIOD_S * 3
     assert low - PERIOD_S < onset < high + PERIOD_S
     assert f"since {answer.diagnosis.onset_s:.1f} s" in answer.diagnosis.verdict
-    assert answer.diagnosis.evidence[-1].movement == 11
+    assert answer.diagnosis.evidence[-1].movement == 8
 
 
 def test_silence_is_stale_and_what_was_known_is_kept(watcher, work):
@@ -81,10 +81,10 @@ def test_silence_is_stale_and_what_was_known_is_kept(watcher, work):
 
 
 def test_a_frozen_sensor_is_never_healthy_and_believed_again_when_it_comes_back(watcher, work):
-    samples = work(18)
+    samples = work(13)
     for time, command, point in samples:
-        answer = watcher.update(time, command, samples[100][2] if 10.0 < time < 20.0 else point)
-        if time < 20.0:
+        answer = watcher.update(time, command, samples[60][2] if 6.0 < time < 12.0 else point)
+        if time < 12.0:
             last = answer
     assert last.diagnosis.undecided.startswith("the tool stands still")
     assert last.diagnosis.posterior["healthy"] < 0.8  # the prior of who watches
@@ -94,7 +94,7 @@ def test_a_frozen_sensor_is_never_healthy_and_believed_again_when_it_comes_back(
 
 
 def test_commands_may_be_given_by_name(twin, work):
-    samples, names = work(6), twin.robot.motor_names
+    samples, names = work(4), twin.robot.motor_names
     by_array, by_name = (monitor(twin, NO_IMPERFECTIONS) for _ in range(2))
     for time, command, point in samples:
         one = by_array.update(time, command, point)
@@ -105,7 +105,7 @@ def test_commands_may_be_given_by_name(twin, work):
 
 
 def test_a_saved_stream_goes_on_as_if_nothing_had_happened(twin, work, tmp_path):
-    samples, path = work(12, stuck=[(2, 7, 12)]), tmp_path / "stream.npz"
+    samples, path = work(8, stuck=[(2, 4, 8)]), tmp_path / "stream.npz"
     method = BayesDiagnoser(twin)
     one, first = StreamingDiagnoser(method), StreamingDiagnoser(method)
     middle = len(samples) // 2
@@ -148,9 +148,9 @@ def test_what_is_no_saved_stream_is_refused(twin, tmp_path, spoil):
             StreamingDiagnoser.load(path, method)
 
 
-@pytest.mark.parametrize("noise", [1e-8, 1e-7, 1e-6, 3e-6])
+@pytest.mark.parametrize("noise", [1e-8, 3e-6])
 def test_references_may_be_noisy(watcher, work, rng, noise):
-    for time, command, point in work(8):
+    for time, command, point in work(6):
         answer = watcher.update(time, command + rng.normal(0.0, noise, 4), point)
     assert answer.diagnosis.diagnosis == "healthy"
     assert answer.diagnosis.probability > 0.9
@@ -159,7 +159,7 @@ def test_references_may_be_noisy(watcher, work, rng, noise):
 def test_clocks_may_count_from_1970(watcher, work):
     """Stamps that large are exact to a quarter of a microsecond only."""
     time = 1.7e9
-    for _, command, point in work(8):
+    for _, command, point in work(6):
         answer = watcher.update(time, command, point)
         time += STEP_S
     assert answer.time == pytest.approx(time - STEP_S)
@@ -187,7 +187,7 @@ def test_between_two_judgements_nothing_said_changes(twin, work):
     """A fleet can be asked at any time, also while a movement is under way."""
     fleet = StreamingFleet(BayesDiagnoser(twin, NO_IMPERFECTIONS, whole_run=False), 1)
     said = None
-    for time, command, point in work(8, stuck=[(1, 3, 8)]):
+    for time, command, point in work(6, stuck=[(1, 2, 6)]):
         changed = fleet.update(time, command[None], point[None])
         found = fleet.diagnosis(0)
         if said is not None and not len(changed):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from failuretwin import BayesDiagnoser
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.links.replay import (
     AS_FAST_AS_POSSIBLE,
@@ -13,7 +14,7 @@ from failuretwin.connection.links.replay import (
     session_events,
 )
 from failuretwin.data_knowledge.readers.raw_sessions import read_session
-from failuretwin.decision.streaming.monitor import monitor
+from failuretwin.decision.streaming.monitor import FaultMonitor
 from failuretwin.decision.streaming.trouble import FrozenSensorDetector, TwoPlaces, UntoldMotion
 
 UNTOLD = "the tool moves though no command came"
@@ -142,15 +143,20 @@ def test_an_arm_that_lags_after_a_long_rest_is_not_dead():
     assert not any(told)
 
 
+FEW = ("healthy", "motor_1:stuck", "motor_3:steady_state_error")
+
+
 @pytest.mark.parametrize(
-    "label", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2, 3, 4))]
+    ("label", "hypotheses"),
+    [(0, FEW), *(pytest.param(k, None, marks=pytest.mark.slow) for k in range(5))],
 )
-def test_healthy_sessions_get_no_other_verdict(data, twin, label):
+def test_healthy_sessions_get_no_other_verdict(data, twin, label, hypotheses):
     """Real sessions with lost commands that are sent again and stalls of the bus of seconds."""
     folder = next((data / f"real_robot_b_20241003/label_{label}").iterdir())
     events = session_events(read_session(folder, twin.robot), twin.robot)
     source = PacedSource("session", events, Pace(AS_FAST_AS_POSSIBLE))
-    shadow, said = Shadow(source, monitor(twin), twin), set()
+    watch = FaultMonitor(BayesDiagnoser(twin, hypotheses=hypotheses, whole_run=False))
+    shadow, said = Shadow(source, watch, twin), set()
     while shadow.step(0.0):
         found = shadow.snapshot.answer.diagnosis
         if found is not None:
