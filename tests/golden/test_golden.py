@@ -13,26 +13,9 @@ from golden_compare import Tolerance, differences
 from write import expected_file
 
 SHOWN = 12
-LONG = (
-    "nine, settled",
-    "nine, unknown",
-    "nine, monitoring",
-    "modes",
-    "modes, settled",
-    "anywhere, unknown",
-    "rough, every mode",
-    "stuck and drift",
-    "pairs, unknown",
-    "stream, watching",
-    "fleet",
-    "ambiguity",
-    "calibration, tool path",
-)
-"""Cases that take long and whose like is among the others."""
-EACH = [pytest.param(case, marks=pytest.mark.slow) if case in LONG else case for case in CASES]
 
 
-@pytest.mark.parametrize("case", EACH)
+@pytest.mark.parametrize("case", CASES)
 def test_what_is_said_of_stored_runs_stays_the_same(case):
     expected = json.loads(expected_file(case).read_text("utf-8"))
     found = differences(outcome(case), expected, CASES[case].tolerance)
