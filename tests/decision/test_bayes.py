@@ -164,7 +164,8 @@ def test_size_of_steady_state_errors_is_found(study):
 
     assert len(rows) >= 0.39 * len(diagnoses)
     assert np.median(np.abs(estimate - truth)) < np.deg2rad(1)
-    assert 0.78 < np.mean((low <= truth) & (truth <= high)) < 0.89  # reached: 28 of 32, 66 of 80
+    most = 0.89 if len(rows) < 40 else 0.87  # reached: 28 of 32, 66 of 80
+    assert 0.78 < np.mean((low <= truth) & (truth <= high)) < most
     assert np.median(high - low) < np.deg2rad(3)
 
 
