@@ -442,8 +442,7 @@ class Posterior:
             moved = f"{motor.replace('_', ' ')} moved {_told_travel(model.twin.robot, k, travel)}"
             hardly = travel[k] < HARDLY * model.least_visible[k]
             if own and untold[own].all():
-                but = "" if hardly else ", which the sensors hardly show"
-                lines.append(f"{moved}{but}: little can be said of it")
+                lines.append(f"{moved}: little can be said of it")
             elif hardly and untold[held].any():
                 lines.append(f"{moved}: if it is stuck, this hardly shows")
             elif hardly and np.isin(suspect, own).any():

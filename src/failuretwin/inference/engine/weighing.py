@@ -189,17 +189,23 @@ class Weighing:
         return runs[:0] if way is None else np.flatnonzero(way.seen.any(axis=(1, 2)))
 
     @cached_property
+    def _summed_at_best(self) -> RunLikelihood:
+        """The runs that node sums weigh too, at the most probable theta."""
+        return replace(self.at_best[self.summed], part_of=None)
+
+    @cached_property
     def _settled_at_best(self) -> list[MarginalLikelihood]:
-        """Settled positions of these runs at the most probable theta, by hypothesis."""
-        alone = replace(self.at_best, moving=None)[self.summed]
-        return marginal_likelihoods(alone, self.hypotheses, self.priors)
+        """Settled positions of these runs, by hypothesis."""
+        whole = self._summed_at_best
+        settled = replace(whole, moving=None, remembered=whole.findings)
+        return marginal_likelihoods(settled, self.hypotheses, self.priors)
 
     @cached_property
     def _whole_at_best(self) -> list[MarginalLikelihood]:
-        """All readings of these runs at the most probable theta, by hypothesis."""
+        """All readings of these runs, by hypothesis."""
         if self.likelihood.moving is None:
             return self._settled_at_best
-        return marginal_likelihoods(self.at_best[self.summed], self.hypotheses, self.priors)
+        return marginal_likelihoods(self._summed_at_best, self.hypotheses, self.priors)
 
     @cached_property
     def log_evidence(self) -> FloatArray:
