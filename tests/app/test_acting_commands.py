@@ -153,7 +153,8 @@ def test_held_motors_in_words(armpi):
 @pytest.mark.parametrize(
     ("text", "unit", "size"),
     [("2", "rad", 2.0), ("2rad", "rad", 2.0), ("-180deg", "rad", -np.pi), ("20%", "ratio", 0.2),
-     ("360deg/s", "rad/s", 2 * np.pi), ("5ms", "s", 0.005), ("5s", "s", 5.0)],
+     ("360deg/s", "rad/s", 2 * np.pi), ("5ms", "s", 0.005), ("5s", "s", 5.0),
+     ("5mm", "m", 0.005), ("5m", "m", 5.0)],
 )  # fmt: skip
 def test_sizes_are_in_the_unit_of_the_mode_or_say_theirs(text, unit, size):
     assert size_of(text, unit, "size") == pytest.approx(size)

@@ -44,6 +44,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.bag_messages import BagTopics
+from failuretwin.data_knowledge.readers.column_map import ANGLE_UNITS, LENGTH_UNITS, TIME_UNITS
 from failuretwin.decision.acting.planner import stopped_learning, wear_weights
 from failuretwin.digital_model.calibrated_robot import (
     CalibratedRobot,
@@ -113,7 +114,8 @@ def emulation_with(faults: Sequence[str], known: CalibratedRobot, seed: int) -> 
         if not size:
             continue
         mode = modes[scheduled.fault.mode]
-        value = size_of(size, mode.unit, f"fault {text!r}: size")
+        unit = known.robot.own_unit(scheduled.fault.motor, mode.unit)
+        value = size_of(size, unit, f"fault {text!r}: size")
         if isinstance(mode, Stuck):
             start[motors.index(scheduled.fault.motor)] = value
         elif sizes.setdefault(mode.mode, value) == value:
@@ -330,8 +332,14 @@ def number_of(value: str, what: str) -> float:
     return number
 
 
-OTHER_UNITS = {"rad": ("deg", np.pi / 180.0), "rad/s": ("deg/s", np.pi / 180.0)}
-OTHER_UNITS |= {"ratio": ("%", 0.01), "s": ("ms", 0.001)}
+OTHER_UNITS = {
+    "rad": ("deg", ANGLE_UNITS["deg"]),
+    "rad/s": ("deg/s", ANGLE_UNITS["deg"]),
+    "m": ("mm", LENGTH_UNITS["mm"]),
+    "m/s": ("mm/s", LENGTH_UNITS["mm"]),
+    "s": ("ms", TIME_UNITS["ms"]),
+    "ratio": ("%", 0.01),
+}
 """The other unit in which a size can be given, and its factor, by the unit of the mode."""
 
 
@@ -362,7 +370,8 @@ def held_of(text: str, robot: Robot) -> tuple[str, float]:
         raise InputError(
             f"--fault is {text!r}, expected MOTOR:stuck=SIZE, such as motor_3:stuck=-20deg."
         )
-    return fault[0].motor, size_of(size, Stuck.unit, f"--fault {text!r}: size")
+    unit = robot.own_unit(fault[0].motor, Stuck.unit)
+    return fault[0].motor, size_of(size, unit, f"--fault {text!r}: size")
 
 
 def spared_of(
