@@ -182,7 +182,7 @@ def test_a_constant_error_in_every_run_is_not_swallowed(armpi, motor, size):
         told = float(line.split(": +")[1].split(" deviations")[0])
         estimate = value(found.calibration, "bias", f"motor_{motor}").value
         assert told == pytest.approx(estimate / 0.0065, abs=0.06)
-        assert told >= 3.0
+        assert told >= 2.5  # of 5: the prior draws an estimate of five runs back
 
 
 def test_a_zero_far_off_is_told_however_little_the_runs_narrow_it(armpi):

@@ -78,7 +78,7 @@ FRAME_OFF = 14.1
 told: 95 % of seven normal numbers are nearer."""
 IDENTIFIED = 0.7
 """An offset is learned where the runs narrow it to this share of the prior's deviation, or move it
-by more than `FAR_OFF` of them."""
+as far as healthy robots hardly ever do."""
 ODD = {
     "bias": f"a zero that is off, or {FAULT_OF_EVERY_RUN}",
     "compliance": "a fault that is there in every run looks like this",
@@ -311,8 +311,9 @@ def _parameters(found: FolderPosterior, believed: Imperfections, robot: Robot) -
             at = REGISTRATION + k * len(motors) + i
             spread, prior = found.deviation[at], found.usual_deviation[at]
             off = float((values[i] - expected[i]) / prior)
-            note = f"{off:+.1f} deviations off what such robots do" if abs(off) > FAR_OFF else ""
-            known = bool(spread < IDENTIFIED * prior) or abs(off) > FAR_OFF
+            odd = _surprise(off, float(spread / prior)) > FAR_OFF
+            note = f"{off:+.1f} deviations off what such robots do" if odd else ""
+            known = bool(spread < IDENTIFIED * prior) or odd
             if not known:
                 note = "the runs do not tell it from what such robots differ by"
             value, deviation = float(values[i]), float(spread)
@@ -322,6 +323,19 @@ def _parameters(found: FolderPosterior, believed: Imperfections, robot: Robot) -
                 )
             )
     return told
+
+
+def _surprise(off: float, doubt: float) -> float:
+    """Return how far off a posterior mean is, in deviations of such means among healthy robots.
+
+    Runs that narrow a prior N(0, 1) to a deviation s move the mean of a robot of its kind by a
+    normal number of variance 1 - s^2. Where they hardly narrow it, s = `IDENTIFIED` counts.
+
+    Args:
+        off: The mean, in deviations of the prior.
+        doubt: s, in the same.
+    """
+    return abs(off) / float(np.sqrt(1.0 - min(doubt, IDENTIFIED) ** 2))
 
 
 def _remarks(parameters: Sequence[Parameter], found: FolderPosterior, runs: RunSet) -> list[str]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import CLEAR, RAISED
@@ -90,3 +90,34 @@ def test_an_error_from_the_beginning_may_be_the_log():
     answer, raised = watch(stream(40.0, 7, off_s=0.0, off_rad=0.15), few)
     assert raised is None
     assert answer.alarm.state == CLEAR
+
+
+def stop_and_go(movements, seed, stuck_s, unseen_s):
+    """Yield time, command and reading of ramps of 1 s, each with a rest of 1 s behind it.
+
+    Motor 3 sticks from `stuck_s` on. Between the times of `unseen_s` the sensor fails behind the
+    first 0.4 s of each ramp, and movements begin 0.6 s after their commands.
+    """
+    rng, twin = np.random.default_rng(seed), DigitalTwin(ROBOT)
+    goals = rng.uniform(-0.7, 0.7, (movements + 2, 4))
+    corners = np.r_[0.0, np.repeat(2.0 * np.arange(1, movements + 2), 2)]
+    corners[2::2] += 1.0
+    told = PchipInterpolator(corners[:-1], np.repeat(goals[: movements + 1], 2, axis=0))
+    for k in range(round(2.0 * movements / STEP_S)):
+        time = k * STEP_S
+        fails = unseen_s[0] <= time < unseen_s[1]
+        seen = told(time - (0.6 if fails else LAG_S))
+        seen[2] = told(min(time, stuck_s))[2]
+        point = twin.path(seen) + rng.normal(scale=NOISE_M, size=3)
+        yield time, told(time), None if k % 2 or (fails and time % 2.0 > 0.4) else point
+
+
+def test_an_arm_that_rests_unseen_is_not_judged_on_its_way():
+    """Its fault, and since when it has it, stand."""
+    found = watching(FEW)
+    for sample in stop_and_go(20, 1, 8.2, (26.0, 36.0)):
+        answer = found.update(*sample)
+        if sample[0] > 16.0:
+            assert answer.diagnosis.diagnosis == "motor_3:stuck"
+            assert answer.diagnosis.onset_s == pytest.approx(8.2, abs=1.0)
+            assert "settled poses" in answer.diagnosis.method

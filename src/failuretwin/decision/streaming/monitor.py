@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from failuretwin.connection.links.base import OK, STALE, Answer
-from failuretwin.core.hypothesis import CLEAR, Hypothesis
+from failuretwin.core.hypothesis import CLEAR, Diagnosis, Hypothesis
 from failuretwin.core.numerics import Weighted, log_of
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
@@ -120,6 +120,7 @@ class FaultMonitor(RobotStream):
         self._concluded = self._present = self._mixture.begin(1)
         self._movements = 0
         self._explained: dict[int, float] = {}
+        self._decided: Diagnosis | None = None
         self._set_up = SetUpWatch(diagnoser)
         self._way = WayWatch(diagnoser, self._mixture.filters[0]) if learns else None
         self._arrived = np.full((0, len(known.scatter)), np.nan)
@@ -241,9 +242,12 @@ class FaultMonitor(RobotStream):
             told = log_of(posterior), explained
             self._rests = rests_throughout(likelihood.evidence, likelihood.model.settings)
             self._misfit = misfit(likelihood, explained)
-        found = self._fleet.diagnosis(0, self._diagnosis, told)
-        if found is not None:
-            self._diagnosis = replace(found, run="stream")
+        found = self._fleet.diagnosis(0, self._decided, told)
+        if found is None:
+            return
+        self._diagnosis = replace(found, run="stream")
+        if not found.undecided:
+            self._decided = self._diagnosis
 
     def _followed(self, likelihood: RunLikelihood, position: StreamPosition) -> FloatArray:
         """Return the probability of each hypothesis, (hypothesis,).

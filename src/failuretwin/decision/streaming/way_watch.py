@@ -34,6 +34,8 @@ WINDOW_S = 6.0
 PAUSE_S = 0.5
 """Time without a new command from which an arm may come to rest [s]: windows in which it has are
 left to what sees rests."""
+FAILING = 3.0
+"""Readings fail where one is missing for a pause and for so many times their usual distance."""
 STILL_RAD = 1e-5
 """Change of a command that is none [rad]."""
 FITTING = 3
@@ -113,7 +115,7 @@ class WayWatch:
     def _end_window(self, rested_s: float | None) -> float:
         """Judge the samples since the last window; return their length if they were judged [h]."""
         some, self._samples = self._samples, self._samples[-1:]
-        rested = rested_s is not None and rested_s >= some[0][0]
+        rested = rested_s is not None and (rested_s >= some[0][0] or _readings_fail(some))
         if rested and _longest_pause(some) > PAUSE_S:
             return 0.0
         hours = (some[-1][0] - some[0][0]) / S_PER_H
@@ -153,6 +155,15 @@ def _longest_pause(some: Sequence[Sample]) -> float:
     time, told = np.array([at for at, _, _ in some]), np.stack([one for _, one, _ in some])
     news = np.abs(np.diff(told, axis=0)).max(axis=1) > STILL_RAD
     return float(np.diff(np.r_[time[0], time[1:][news], time[-1]]).max())
+
+
+def _readings_fail(some: Sequence[Sample]) -> bool:
+    """Return whether readings are missing for so long that an arm may have rested unseen."""
+    read = [at for at, _, point in some if point is not None]
+    if len(read) < 2:
+        return True
+    missing = float(np.diff([some[0][0], *read, some[-1][0]]).max())
+    return missing > max(PAUSE_S, FAILING * float(np.median(np.diff(read))))
 
 
 def _as_run(some: Sequence[Sample], diagnoser: BayesDiagnoser) -> RunTable | None:
