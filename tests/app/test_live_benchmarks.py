@@ -35,6 +35,6 @@ def test_five_real_sessions_through_ros_give_the_diagnoses_of_the_batch(roscore,
 
 
 def test_nine_states_are_named_through_ros(roscore):
-    told = run(roscore, "live.py", 2, 30)
+    told = run(roscore, "live.py", 2)
     assert "9 of 9 right" in told
     assert re.search(r"latency of a sample through roscore: median [\d.]+ ms", told)

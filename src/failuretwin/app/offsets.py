@@ -135,7 +135,7 @@ def _corrected(
 def _in_words(offset: JointOffset, robot: Robot) -> str:
     size, (low, high) = np.rad2deg(offset.size), np.rad2deg(offset.interval_90)
     motor = joint_names_in(offset.motor.replace("_", " "), robot)
-    return f"{motor} reads {size:+.1f} deg off its command ({low:+.1f} to {high:+.1f})"
+    return f"{motor} reads {size:+.1f} deg off its command, sag apart ({low:+.1f} to {high:+.1f})"
 
 
 def _sure(offset: JointOffset) -> str:
