@@ -131,7 +131,9 @@ def latency(robot: Robot, samples: int = 300) -> list[float]:
 
 def main() -> None:
     """Print a line for each state, then the latency."""
-    speed, seconds, seed = (float(a) for a in [*sys.argv[1:], *("1", "45", "0")[len(sys.argv) - 1 :]])
+    speed, seconds, seed = (
+        float(a) for a in [*sys.argv[1:], *("1", "45", "0")[len(sys.argv) - 1 :]]
+    )
     robot = load_robot("armpi_fpv")
     taken = 1000.0 * np.array(latency(robot))
     print(

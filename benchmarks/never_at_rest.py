@@ -240,7 +240,7 @@ def simulated(
     knots = np.arange(0.0, duration_s + 2.0 * WANDER_S, WANDER_S)
     scatter = CubicSpline(knots, rng.standard_normal((len(knots), motors)))(time)
     scatter *= np.asarray(settling.scatter)
-    error, onset = np.zeros((len(time), motors)), np.nan
+    error, onset, size = np.zeros((len(time), motors)), np.nan, np.nan
     if case.fault == "steady_state_error":
         onset = 0.0 if len(strokes) else rng.uniform(*ONSET_OF_CURVES) * duration_s
         error[:, case.motor] = _errors(time, strokes, onset, rng) * seen[case.motor]
@@ -255,10 +255,10 @@ def simulated(
     elif case.fault == SLOW:
         followed[:, case.motor] = _limited(time, told, onset)
     if case.fault == PLAY:
-        play = rng.uniform(*PLAY_RAD)
-        followed[:, case.motor] = _with_play(np.where(time < onset, 0.0, play), told)
+        size = rng.uniform(*PLAY_RAD)
+        followed[:, case.motor] = _with_play(np.where(time < onset, 0.0, size), told)
     if case.fault == LATE:
-        late_by = np.where(time < onset, 0.0, DEAD_S)
+        size, late_by = DEAD_S, np.where(time < onset, 0.0, DEAD_S)
         followed[:, case.motor] = np.interp(time - late_by, time, told)
     wanted = followed + np.asarray(settling.bias) - friction + scatter + error
     wanted = np.stack([np.interp(time - arm.delay_s, time, one) for one in wanted.T], axis=-1)
@@ -268,9 +268,8 @@ def simulated(
         onset = rng.uniform(0.0, 0.7 * duration_s)
         held[0, time >= onset, case.motor] = True
     if case.fault == STICKS:
-        parts = draw_episodes(
-            onset, duration_s, rng.uniform(*SHARE), MODE_TABLE[STICKS].episode_s, rng
-        )
+        size = rng.uniform(*SHARE)
+        parts = draw_episodes(onset, duration_s, size, MODE_TABLE[STICKS].episode_s, rng)
         for begin, end in parts:
             held[0, (time >= begin) & (time < end), case.motor] = True
     drive = Drive(wanted[None], held, compliance=arm.compliance[None])
@@ -280,6 +279,7 @@ def simulated(
     ends = strokes[(strokes > 0.0) & (strokes <= time[-1])] if motion is blended else np.zeros(0)
     whose, when = max(case.motor, 0), ends if len(ends) else time[time >= np.nan_to_num(onset)]
     there = np.interp(when, time, error[:, whose])
+    size = float(np.nan_to_num(size, nan=np.sqrt(np.mean(there**2))))
     name = "healthy" if case.motor < 0 else f"{robot.motor_names[case.motor]}:{case.fault}"
     return RunTable(
         run=[f"{name}/{case.seed}"],
@@ -289,7 +289,7 @@ def simulated(
         measured=measured[None],
         position=read[None],
         measured_rate_hz=rate,
-        truth=Truth([name], [{}], np.array([onset]), np.array([np.sqrt(np.mean(there**2))])),
+        truth=Truth([name], [{}], np.array([onset]), np.array([size])),
         attributes={"robot": robot.name, "source": "simulated"},
     )
 
@@ -513,6 +513,10 @@ def line(found: list[Diagnosis], seconds: float) -> str:
     return ", ".join(parts)
 
 
+ENDS = ("onset_90", "onset"), ("magnitude_90", "magnitude")
+"""Intervals of a diagnosis and what they should hold."""
+
+
 def intervals(found: list[Diagnosis], runs: xr.Dataset) -> str:
     """Return how many 90 % intervals hold the truth, of the faults that are named right."""
     told = []
@@ -520,6 +524,7 @@ def intervals(found: list[Diagnosis], runs: xr.Dataset) -> str:
         ("stuck", "onset_90", "onset"),
         ("steady_state_error", "onset_90", "onset"),
         ("steady_state_error", "magnitude_90", "magnitude"),
+        *((mode, field, name) for mode in (LATE, PLAY, STICKS) for field, name in ENDS),
     ):
         pairs = zip(found, as_floats(runs[name].values).tolist(), strict=True)
         some = [
@@ -528,7 +533,8 @@ def intervals(found: list[Diagnosis], runs: xr.Dataset) -> str:
             if d.diagnosis == d.truth and str(d.truth).endswith(mode)
         ]
         inside = sum(bool(ends) and ends[0] <= value <= ends[1] for ends, value in some)
-        told.append(f"{name} of {mode} {inside} of {len(some)}")
+        if some or mode in MODES:
+            told.append(f"{name} of {mode} {inside} of {len(some)}")
     return f"in their 90 % intervals: {', '.join(told)}"
 
 

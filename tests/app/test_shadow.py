@@ -221,8 +221,8 @@ def test_the_user_is_told_how_late_commands_come(twin, armpi):
     events = [reading(0.0), reading(2.0), command(0.2, 0.8), reading(2.1), reading(2.2)]
     script = Script(events)
     shadow = Shadow(script, Notebook(), twin)
-    console = Console(file=StringIO())
-    told = watch_until_end(shadow, console, np.inf)
+    told = Changes(armpi.motor_names)
+    watch_until_end(shadow, told, Console(file=StringIO()), np.inf)
     late = "commands come late: put commands_late_s = 2.0 into the --topics file"
     assert late in [change.text for change in told.lines]
 
@@ -235,7 +235,8 @@ def test_a_source_from_which_nothing_comes_is_named(twin, armpi, clock):
 
     script = Silent([None] * 9)
     shadow = Shadow(script, Notebook(), twin)
-    told = watch_until_end(shadow, Console(file=StringIO()), np.inf)
+    told = Changes(armpi.motor_names)
+    watch_until_end(shadow, told, Console(file=StringIO()), np.inf)
     assert [change.text for change in told.lines] == ["nothing comes from a script"]
 
 
@@ -338,6 +339,22 @@ def test_what_changes_is_told_once(armpi):
         "CLEARED: the alarm for motor 3 stuck lasted 62 s; healthy, 99 % sure",
     ]
     assert str(changes.lines[1]) == "     3.0 s  ALARM: motor 3 stuck"
+
+
+def test_alarms_that_come_and_go_are_told(armpi):
+    """From the third in an hour on; one that changes its cause without an end is one alarm."""
+    changes, moments = Changes(armpi.motor_names), [moment(0.0, OK, HEALTHY)]
+    other = Alarm(RAISED, "motor_3:steady_state_error", LASTS)
+    for at in (10.0, 40.0, 90.0, 4000.0):
+        moments += [
+            moment(at, OK, STUCK, Alarm(RAISED, CAUSE, LASTS)),
+            moment(at + 1.0, OK, STUCK, other),
+            moment(at + 2.0, OK, HEALTHY, Alarm(CLEAR, "", ENDED)),
+        ]
+    told = [line for line in lines(changes, moments) if "come" in line]
+    line = "motor 3: 3 alarms within 80 s, each after a healthy spell: a fault that comes and goes"
+    assert told == [line]
+    assert changes.recurring == []  # the last alarm is by itself
 
 
 def test_an_alarm_that_is_not_sure_says_why_and_then_that_it_is_sure(armpi):
@@ -472,10 +489,11 @@ def test_the_view_shows_motors_posterior_and_changes(armpi):
     assert "OK" not in captured.get()
 
 
-def test_a_terminal_and_a_pipe_show_the_same_lines(twin, capsys):
+def test_a_terminal_and_a_pipe_show_the_same_lines(twin, armpi, capsys):
     shown = StringIO()
     for console in (Console(file=StringIO()), Console(file=shown, force_terminal=True, width=120)):
-        watch_until_end(Shadow(Script([reading(0.0)]), Notebook(), twin), console, np.inf)
+        shadow = Shadow(Script([reading(0.0)]), Notebook(), twin)
+        watch_until_end(shadow, Changes(armpi.motor_names), console, np.inf)
     line = "0.0 s  OK: healthy, 99 % sure"
     assert line in capsys.readouterr().out
     assert line in shown.getvalue()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict
 
 import numpy as np
@@ -12,7 +13,7 @@ import failuretwin as ft
 from failuretwin.core.config import from_table
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.failure_behavior.registry import load_modes
-from failuretwin.inference.faults.motor_residual import motor_residual
+from failuretwin.inference.faults.motor_residual import lone_motor, motor_residual
 
 
 def seen(tmp_path, motor, size, hypotheses=("healthy", "unknown")):
@@ -39,6 +40,29 @@ def check(told, motor, size):
 def test_the_motor_and_its_displacement_are_those_of_the_fault(tmp_path, motor, size):
     diagnoser, runs = seen(tmp_path, motor, size)
     check(motor_residual(diagnoser.seen(runs).sample, 0), motor, size)
+
+
+@pytest.mark.parametrize(("motor", "size"), [("motor_2", 0.6), ("motor_3", -0.4)])
+def test_a_motor_that_alone_explains_movements_is_named(tmp_path, motor, size):
+    diagnoser, runs = seen(tmp_path, motor, size)
+    likelihood = diagnoser.seen(runs).sample
+    told = lone_motor(likelihood, 0, likelihood.usable[0])
+    name, off = re.fullmatch(
+        r"(motor \d) alone explains it, up to (\S+) deg off: .*", told
+    ).groups()
+    assert name == motor.replace("_", " ")
+    assert float(off) == pytest.approx(np.rad2deg(size), abs=2.0)
+
+
+def test_no_motor_is_named_where_two_explain_movements_or_none_does(tmp_path):
+    diagnoser, runs = seen(tmp_path, "motor_2", 0.6)
+    likelihood = diagnoser.seen(runs).sample
+    nowhere = np.zeros_like(likelihood.usable[0])
+    assert lone_motor(likelihood, 0, nowhere) == ""
+    shift = np.array([0.0, 0.0, 0.3])
+    away = runs.assign(measured=(runs["measured"].dims, runs["measured"].values + shift))
+    likelihood = diagnoser.seen(away).sample
+    assert lone_motor(likelihood, 0, likelihood.usable[0]) == ""
 
 
 @pytest.mark.slow

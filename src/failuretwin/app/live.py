@@ -51,11 +51,12 @@ LATE_S = 0.3
 class _Screen:
     """Reports changes: in a view on a terminal, else a line for each change."""
 
-    def __init__(self, shadow: Shadow, live: Live | None, keeper: WatchKeeper | None) -> None:
-        motors = shadow.twin.robot.motor_names
-        self.changes = Changes(motors)
+    def __init__(
+        self, shadow: Shadow, changes: Changes, live: Live | None, keeper: WatchKeeper | None
+    ) -> None:
+        self.changes = changes
         self._shadow, self._live, self._keeper = shadow, live, keeper
-        self._view = View(motors, shadow.source.name)
+        self._view = View(shadow.twin.robot.motor_names, shadow.source.name)
         self._start_s, self._drawn_s, self._set_up_told = time.monotonic(), 0.0, False
 
     def look(self, last: bool = False) -> None:
@@ -97,12 +98,13 @@ class _Screen:
 
 def watch_until_end(
     shadow: Shadow,
+    changes: Changes,
     console: Console,
     until_s: float,
     prober: Prober | None = None,
     keeper: WatchKeeper | None = None,
-) -> Changes:
-    """Watch a robot until `until_s` of our monotonic clock [s], and return all that has changed.
+) -> None:
+    """Watch a robot until `until_s` of our monotonic clock [s], and notice all that changes.
 
     A terminal gets a live view, other outputs a line for each change. With a prober, one of the
     sinks, the robot makes diagnostic movements when they are due. A keeper stores each change
@@ -110,13 +112,12 @@ def watch_until_end(
     """
     live = Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext()
     with live as shown:
-        screen, going = _Screen(shadow, shown, keeper), True
+        screen, going = _Screen(shadow, changes, shown, keeper), True
         while going:
             going = shadow.step(POLL_S) and time.monotonic() < until_s
             screen.look(last=not going)
             if going and prober is not None and prober.due:
                 prober.ask(screen.hear, screen.say)
-    return screen.changes
 
 
 def basis_line(known: CalibratedRobot, calibration: Path | None, budget: float, goals: bool) -> str:

@@ -190,8 +190,10 @@ KEPT = 1000
 GARBAGE_AFTER_S, GARBAGE_EVERY_S = 10.0, 3600.0
 """Time between the first two reports of messages that make no sense, or of stamps that leap; it
 doubles with each, up to the second [s]."""
-FIGURE = re.compile(r"(?:over )?(?<!motor )[-+]?\b\d[\d.]*")
-"""Figures in a message; a message that differs only in them is no news."""
+RECURS, RECURS_WITHIN_S = 3, 3600.0
+"""From so many alarms of one motor within that time [s] on, it is told that they come and go."""
+FIGURE = re.compile(r"(?:over )?(?<!motor )[-+]?\b\d[\d.]*(?:, \d+)*")
+"""Figures in a message, and lists of them; a message that differs only in them is no news."""
 
 
 class _NowAndThen:
@@ -215,6 +217,29 @@ def _cleared(before: Alarm, now: Alarm) -> str:
     if before.state == SUSPECTED or episode is None or episode.duration_s is None:
         return f"CLEARED: {cause} is no longer suspected"
     return f"CLEARED: the alarm for {cause} lasted {episode.duration_s:.0f} s"
+
+
+class _Recurrence:
+    """Alarms of each motor that followed a healthy spell."""
+
+    def __init__(self) -> None:
+        self._raised: dict[str, list[float]] = {}
+
+    def count(self, alarm: Alarm, at: float) -> None:
+        """Count an alarm that is raised at a time of the stream [s]."""
+        motor = alarm.cause.partition(":")[0]
+        times = self._raised.setdefault(motor, [])
+        times[:] = [*(before for before in times if at - before <= RECURS_WITHIN_S), at]
+
+    @property
+    def told(self) -> list[str]:
+        """What is to be said of motors whose alarms come and go."""
+        return [
+            f"{motor.replace('_', ' ')}: {len(times)} alarms within "
+            f"{times[-1] - times[0]:.0f} s, each after a healthy spell: a fault that comes and goes"
+            for motor, times in self._raised.items()
+            if len(times) >= RECURS
+        ]
 
 
 @dataclass(frozen=True)
@@ -243,6 +268,12 @@ class Changes:
         self._counts = LinkCounts()
         self._jumps = 0
         self._of_garbage, self._of_jumps = _NowAndThen(), _NowAndThen()
+        self._recurrence = _Recurrence()
+
+    @property
+    def recurring(self) -> list[str]:
+        """What is to be said of motors whose alarms come and go, a line each."""
+        return self._recurrence.told
 
     def notice(
         self, snapshot: Snapshot, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]
@@ -283,6 +314,9 @@ class Changes:
         if told:
             return []
         arm = statuses(answer, self._motors)[0]
+        if now.state == RAISED and (before is None or before.state != RAISED):
+            self._recurrence.count(now, snapshot.stream_time)
+            return [str(arm), *self.recurring]
         if before is None or same or now.state != CLEAR:
             return [str(arm)]
         return [f"{_cleared(before, now)}; {arm.message}"]

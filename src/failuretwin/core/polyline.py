@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from failuretwin.core.compiled import compiled
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 
 Corner = tuple[float, float]
@@ -58,18 +59,29 @@ def simplify(
     fixed[[end for rest in rests for end in rest]] = True
     kept = fixed.copy()
     kept[[0, -1]] = True
-    stack = list(pairwise(np.flatnonzero(kept).tolist()))
-    while stack:
-        first, last = stack.pop()
-        inner = slice(first + 1, last)
-        line = np.interp(time[inner], time[[first, last]], value[[first, last]])
-        distance = np.abs(value[inner] - line)
-        if len(distance) and distance.max() > tolerance:
-            worst = first + 1 + int(np.argmax(distance))
-            kept[worst] = True
-            stack += [(first, worst), (worst, last)]
+    _keep_corners(time, value, tolerance, kept)
     times, values, fixed = _sharpen(np.flatnonzero(kept), time, value, fixed)
     return times, _level(values, fixed, 2.0 * tolerance)
+
+
+@compiled
+def _keep_corners(time: FloatArray, value: FloatArray, tolerance: float, kept: BoolArray) -> None:
+    """Mark the corners between those that are `kept`, (sample,): each the farthest off its line."""
+    ends = np.flatnonzero(kept)
+    for k in range(len(ends) - 1):
+        stack = [(ends[k], ends[k + 1])]
+        while stack:
+            first, last = stack.pop()
+            slope = (value[last] - value[first]) / (time[last] - time[first])
+            worst, farthest = first, tolerance
+            for i in range(first + 1, last):
+                off = abs(value[i] - (slope * (time[i] - time[first]) + value[first]))
+                if off > farthest:
+                    worst, farthest = i, off
+            if worst > first:
+                kept[worst] = True
+                stack.append((first, worst))
+                stack.append((worst, last))
 
 
 def simplify_motors(

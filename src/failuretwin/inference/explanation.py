@@ -32,11 +32,15 @@ from failuretwin.inference.advice import (
     rests_on_one_movement,
 )
 from failuretwin.inference.observation.between_commands import TOO_SELDOM
-from failuretwin.inference.set_ups.wrong_setup import DOUBTS, MISFITS, NOWHERE, undone
+from failuretwin.inference.set_ups.wrong_setup import ALONE, DOUBTS, MISFITS, NOWHERE, undone
 
 TELLING_NATS = 1.0
 """Evidence of a movement worth telling [nats]: it changes the odds by a factor of 2.7."""
 
+LARGE_FAULT_ADVICE = (
+    "Look at the motor that is named. `--hypotheses` with drift or unknown weighs faults of any "
+    "size."
+)
 WRONG_SETUP_ADVICE = (
     "Put right what the verdict names, or check that the log is of this robot, and diagnose the "
     "same log again."
@@ -222,6 +226,8 @@ def explanation(
 
 def undecided_step(reason: str) -> str:
     """Return what to do about a run that allows no verdict, for this reason."""
+    if ALONE in reason:
+        return LARGE_FAULT_ADVICE
     if NOWHERE in reason:
         return WRONG_SETUP_ADVICE
     if reason == TOO_SELDOM:

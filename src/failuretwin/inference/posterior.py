@@ -22,7 +22,7 @@ from failuretwin.core.hypothesis import (
     single_faults,
 )
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import FaultMode, Signature
@@ -43,7 +43,7 @@ from failuretwin.inference.faults.marginal import (
     marginal_likelihood,
 )
 from failuretwin.inference.faults.missed_movements import missed_movements_likelihood
-from failuretwin.inference.faults.motor_residual import motor_residual
+from failuretwin.inference.faults.motor_residual import lone_motor, motor_residual
 from failuretwin.inference.faults.prior_odds import log_prior, prior_odds
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.faults.stuck import stuck_model
@@ -51,13 +51,12 @@ from failuretwin.inference.faults.unknown import unknown_likelihood
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.movements.two_joint_likelihood import two_joint_likelihood
 from failuretwin.inference.observation.between_commands import TOO_SELDOM
-from failuretwin.inference.observation.evidence import SettledEvidence, unused_movements
-from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.evidence import unused_movements
 from failuretwin.inference.observation.log_quality import (
     LogQuality,
     commands_beyond,
 )
-from failuretwin.inference.set_ups.wrong_setup import NOWHERE, nowhere_near
+from failuretwin.inference.set_ups.wrong_setup import NOTHING_SIMPLE, NOWHERE, wrong_setup
 
 # From a hypothesis to what runs say of it.
 
@@ -203,25 +202,25 @@ FEW_MOVEMENTS = 2
 
 def abstention_reason(
     quality: LogQuality,
-    evidence: SettledEvidence,
+    likelihood: RunLikelihood,
     run: int,
     probability: float,
     by_movement: FloatArray,
-    model: HealthyModel,
+    before: int = 0,
 ) -> str:
     """Return why a run allows no verdict, empty if it does.
 
     Args:
         quality: Defects of the log.
-        evidence: Settled positions.
+        likelihood: The runs.
         run: Index of the run.
         probability: Posterior of the best hypothesis.
         by_movement: Log density of each movement under the best hypothesis, (movement,).
-        model: The healthy robot.
+        before: Movements of the stream before the run.
     """
     if quality.fatal:
         return quality.fatal
-    usable = evidence.usable[run]
+    evidence, usable = likelihood.evidence, likelihood.usable[run]
     if not evidence.movements.exists[run].any():
         return "no motor is told to move"
     if not usable.any():
@@ -229,14 +228,25 @@ def abstention_reason(
     if usable.sum() <= FEW_MOVEMENTS and probability < 0.5:
         count = int(usable.sum())
         return f"only {counted(count, 'movement')} can be used and no hypothesis stands out"
-    unexplained = usable & (by_movement < model.outlier_log_density + UNEXPLAINED_NATS)
+    outlier = likelihood.model.outlier_log_density
+    unexplained = usable & (by_movement < outlier + UNEXPLAINED_NATS)
     if 2 * unexplained.sum() <= usable.sum():
         return ""
-    which = ", ".join(str(m + 1) for m in np.flatnonzero(unexplained))
-    if not model.sensors.sees_tool:
+    which = ", ".join(str(before + n) for n in np.unique(evidence.numbers[run][unexplained]))
+    if not likelihood.model.sensors.sees_tool:
         return f"after movement {which} no hypothesis explains what the sensors read"
+    return f"after movement {which} {NOWHERE}: {_why_nowhere(likelihood, run, unexplained)}"
+
+
+def _why_nowhere(likelihood: RunLikelihood, run: int, unexplained: BoolArray) -> str:
+    """Return what explains the movements of a run that no hypothesis does, a clause."""
+    evidence, usable = likelihood.evidence, likelihood.usable[run]
     target, point = evidence.movements.target[run][usable], evidence.point[run][usable, :3]
-    return f"after movement {which} {NOWHERE}: {nowhere_near(model.twin, target, point)}"
+    setup = wrong_setup(likelihood.model.twin, target, point)
+    if setup is not None:
+        return setup.told
+    alone = "" if evidence.on_the_way[run] else lone_motor(likelihood, run, unexplained)
+    return alone or NOTHING_SIMPLE
 
 
 NEVER_AT_REST = (
@@ -310,12 +320,13 @@ class Posterior:
         assert self.log_settled is not None, "this posterior was made without settled evidence"
         return self.log_settled
 
-    def undecided(self, run: int, quality: LogQuality) -> str:
+    def undecided(self, run: int, quality: LogQuality, before: int = 0) -> str:
         """Return why a run allows no verdict, empty if it does.
 
         Args:
             run: Index of the run.
             quality: Defects of its log.
+            before: Movements of the stream before it.
         """
         best = int(np.argmax(self.log_posterior[run]))
         if self.no_verdict and self.no_verdict[run] and not quality.fatal:
@@ -324,11 +335,11 @@ class Posterior:
         explained = self.weights[best].settled(run) if known is None else known[run]
         return abstention_reason(
             quality,
-            self.likelihood.evidence,
+            self.likelihood,
             run,
             float(np.exp(self.log_posterior[run, best])),
             explained,
-            self.likelihood.model,
+            before,
         )
 
     def posterior(self, run: int, undecided: str) -> FloatArray:
@@ -361,9 +372,10 @@ class Posterior:
         robot = model.twin.robot
         order = np.argsort(-self.log_posterior[run], kind="stable")
         ranked = [self.hypotheses[i] for i in order]
-        best, undecided = self.weights[order[0]], self.undecided(run, quality)
+        best, before = self.weights[order[0]], place.movements
+        undecided = self.undecided(run, quality, before)
         posterior = self.posterior(run, undecided)
-        unused = unused_movements(evidence, run)
+        unused = unused_movements(evidence, run, before)
         used = "settled poses" if self.likelihood.moving is None else "whole run"
         used = "readings on the way" if evidence.on_the_way[run] else used
         used += "" if model.sensors.tool_alone else f", by {'+'.join(model.sensing)}"
@@ -385,7 +397,7 @@ class Posterior:
         if not undecided:
             diagnosis = replace(diagnosis, evidence=self._evidence(run, order, place))
             estimate = best.estimate(run)
-            losses = [*self._losses(run, estimate, ranked[0]), *self._not_shown(run)]
+            losses = [*self._losses(run, estimate, ranked[0], before), *self._not_shown(run)]
             diagnosis = _with_estimate(diagnosis, ranked[0], estimate, place, robot)
             if not ranked[0].known:
                 diagnosis = replace(diagnosis, residual=motor_residual(self.likelihood, run))
@@ -410,13 +422,15 @@ class Posterior:
             for m in usable
         )
 
-    def _losses(self, run: int, estimate: Estimate, hypothesis: Hypothesis) -> list[str]:
+    def _losses(
+        self, run: int, estimate: Estimate, hypothesis: Hypothesis, before: int
+    ) -> list[str]:
         """Return the commands that seem not to have arrived if `hypothesis` is true."""
         motors = self.likelihood.model.twin.robot.motor_names
         faulty = [fault.motor for fault in hypothesis.faults]
         return lost_command_lines(
             estimate.outcome_probability,
-            self.likelihood.evidence.numbers[run].tolist(),
+            (before + self.likelihood.evidence.numbers[run]).tolist(),
             self.likelihood.model.lost_commands.lost,
             motors,
             faulty,

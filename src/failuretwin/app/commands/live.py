@@ -92,7 +92,7 @@ def watch(
 
     from failuretwin.app.arms import connect
     from failuretwin.app.live import basis_line, fit_of, watch_until_end
-    from failuretwin.app.shadow import Shadow
+    from failuretwin.app.shadow import Changes, Shadow
     from failuretwin.connection.links.recorder import Recorder
     from failuretwin.connection.links.ros_messages import load_topics
     from failuretwin.connection.links.statuses import statuses
@@ -126,16 +126,17 @@ def watch(
         if record is not None:
             sinks.append(stack.enter_context(Recorder(record, model)))
         shadow = Shadow(link, diagnoser, known.twin, sinks, wait_s)
-        keeper = None
+        keeper, changes = None, Changes(model.motor_names)
         if stored is not None:
             keeper = _begun(stored, source, sensing, known, recorded)
         with until_interrupted():
-            watch_until_end(shadow, console(), time.monotonic() + length, prober, keeper)
+            end_s = time.monotonic() + length
+            watch_until_end(shadow, changes, console(), end_s, prober, keeper)
     if keeper is not None:
         keeper.end(shadow.snapshot, decided=diagnoser.fit.seen > PROOF)
     arm = statuses(shadow.snapshot.answer, model.motor_names)[0]
-    tell(fit_of(diagnoser))
-    tell(f"last answer: {arm}")
+    for line in (fit_of(diagnoser), *changes.recurring, f"last answer: {arm}"):
+        tell(line)
     if stored is not None:
         tell("" if life is None else life.keep_watch(diagnoser.life))
         tell(stored.remembered("watch")[0])

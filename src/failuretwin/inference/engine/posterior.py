@@ -297,9 +297,16 @@ def theta_parts(evidence: RunsEvidence, least: float = LEAST_SHARE) -> list[Thet
     return [_theta_of(evidence, h, whole, least) for h in range(len(evidence.hypotheses))]
 
 
-def theta_posterior(evidence: RunsEvidence) -> tuple[FloatArray, FloatArray]:
-    """Return mean (run, theta) and covariance (run, theta, theta) of theta over all hypotheses."""
-    return pooled(theta_parts(evidence), evidence.scene.moments.runs)
+def theta_posterior(
+    evidence: RunsEvidence, least: float = LEAST_SHARE
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean (run, theta) and covariance (run, theta, theta) of theta over all hypotheses.
+
+    Args:
+        evidence: The runs.
+        least: Probability of a pick from which it counts.
+    """
+    return pooled(theta_parts(evidence, least), evidence.scene.moments.runs)
 
 
 def pooled(parts: Sequence[ThetaPart], runs: int) -> tuple[FloatArray, FloatArray]:

@@ -51,6 +51,8 @@ TOLD = 0.9
 """Probability from which a run says what it had to assume of its robot."""
 SURE = 0.95
 """Probability of a displaced sensor from which it is told."""
+ROUGHLY = 1e-3
+"""Probability of a pick from which it counts where zeros are told to be odd."""
 ALLOWED_FOR = "; allowed for"
 """Said where verdicts count with it."""
 
@@ -420,7 +422,7 @@ def odd_zeros_of(weighing: Weighing, usual: FloatArray, given: FloatArray) -> li
     """
     motors = weighing.layout.motors
     zeros = slice(REGISTRATION, REGISTRATION + motors)
-    mean, covariance = theta_posterior(weighing.evidence)
+    mean, covariance = theta_posterior(weighing.evidence, ROUGHLY)
     deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, zeros]
     off = mean[:, zeros] + given[zeros]
     sure = np.maximum(np.abs(off) - 2.0 * deviation, 0.0) / usual[zeros]

@@ -14,11 +14,43 @@ from __future__ import annotations
 
 import numpy as np
 
-from failuretwin.core.hypothesis import MotorResidual
-from failuretwin.core.numerics import log_fall
-from failuretwin.core.types import FloatArray
+from failuretwin.core.hypothesis import SURE, MotorResidual
+from failuretwin.core.numerics import log_fall, log_sum
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.inference.movements.joint_likelihood import LEAST_PRECISION, JointLikelihood
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.set_ups.set_ups import shown, spoken
+from failuretwin.inference.set_ups.wrong_setup import ALONE
+
+EXPLAINED = 25.0
+"""Squared distance up to which a motor that stands elsewhere explains a position."""
+
+
+def lone_motor(likelihood: RunLikelihood, run: int, movements: BoolArray) -> str:
+    """Return which motor alone explains some movements of a run, in words; empty: none surely does.
+
+    Args:
+        likelihood: The runs.
+        run: Index of the run.
+        movements: The movements, (movement,).
+    """
+    model = likelihood.model
+    says = [_log_evidence(one)[run, movements] for one in likelihood.findings.profiles]
+    total = np.array([one.max(axis=1).sum() for one in says])
+    motor = int(np.argmax(total))
+    if total[motor] - log_sum(total, axis=0) < np.log(SURE):
+        return ""
+    profile, best = likelihood.findings.profiles[motor], says[motor].argmax(axis=1)
+    at = np.flatnonzero(movements)
+    if (profile.min_distance2[run, at, best] > EXPLAINED).any():
+        return ""
+    shift = profile.turned((profile.mode - profile.faulty_baseline)[run, at, best])
+    size, unit = shown(model.twin.robot, motor)
+    farthest = size * float(shift[np.abs(shift).argmax()])
+    return (
+        f"{spoken(model.twin.robot, motor)} {ALONE}, up to {farthest:+.3g} {unit} off: "
+        "more than the faults that are considered"
+    )
 
 
 def motor_residual(likelihood: RunLikelihood, run: int) -> MotorResidual | None:

@@ -418,8 +418,14 @@ def _spread_out(time: FloatArray, least_step: float) -> IntArray:
     return np.array(kept, dtype=np.int64)
 
 
-def unused_movements(evidence: SettledEvidence, run: int) -> list[str]:
-    """Return why movements of a run are not used, a line each."""
+def unused_movements(evidence: SettledEvidence, run: int, before: int = 0) -> list[str]:
+    """Return why movements of a run are not used, a line each.
+
+    Args:
+        evidence: Settled positions.
+        run: Index of the run.
+        before: Movements of the stream before the run.
+    """
     lines = []
     on_the_way = bool(evidence.on_the_way[run])
     for movement in np.flatnonzero(evidence.movements.exists[run] & ~evidence.usable[run]):
@@ -429,5 +435,5 @@ def unused_movements(evidence: SettledEvidence, run: int) -> list[str]:
             reason = "the tool does not come to rest"
         else:
             reason = "no reading while the tool is at rest"
-        lines.append(f"movement {evidence.numbers[run, movement]} not used: {reason}")
+        lines.append(f"movement {before + evidence.numbers[run, movement]} not used: {reason}")
     return lines

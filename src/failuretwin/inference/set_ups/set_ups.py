@@ -238,7 +238,7 @@ def zero_off(robot: Robot, motor: int, zero: float) -> SetUp:
         zero: Where it stands where the log says 0 [rad].
     """
     none = LogCorrection.none(len(robot.motors))
-    size, unit = _shown(robot, motor)
+    size, unit = shown(robot, motor)
     near = 0.5 * np.exp(-0.5 * (zero / ZERO_RAD) ** 2) / (ZERO_RAD * np.sqrt(2.0 * np.pi))
     log_prior = np.log(SHARES["zero"] / len(robot.motors)) + np.log(near + 0.25 / np.pi)
     return SetUp(
@@ -262,7 +262,7 @@ FAR_OFF = 3.0
 """Offsets so many deviations off what such robots do are told."""
 
 
-def _shown(robot: Robot, motor: int) -> tuple[float, str]:
+def shown(robot: Robot, motor: int) -> tuple[float, str]:
     """Return factor and unit in which the zero of a motor is told, as sizes of faults are."""
     return (1e3, "mm") if robot.slides[motor] else (float(np.rad2deg(1.0)), "deg")
 
@@ -278,7 +278,7 @@ def odd_zero(robot: Robot, zero: FloatArray, deviations: FloatArray) -> str:
     motor = int(np.argmax(deviations))
     if deviations[motor] < FAR_OFF:
         return ""
-    size, unit = _shown(robot, motor)
+    size, unit = shown(robot, motor)
     return (
         f"{spoken(robot, motor)} rests {size * zero[motor]:+.2g} {unit} off what such robots "
         f"do (by {deviations[motor]:.1f} deviations at least): a zero that is off, or "

@@ -19,6 +19,13 @@ from failuretwin.inference.set_ups.set_ups import SetUp, extent, simple_set_ups
 
 NOWHERE = "the tool is nowhere near where it should be"
 """What is said of a run that fits no hypothesis."""
+NOTHING_SIMPLE = (
+    "in this run alone no unit, axis, frame, sense or exchange of columns explains it; a spoilt "
+    "sensor, another robot, or a fault beside a wrong set-up may"
+)
+"""What is said where no simple mistake explains it."""
+ALONE = "alone explains it"
+"""Said of a motor that does."""
 MISFITS, MAY_MISFIT = "the log does not fit the profile", "the log may not fit the profile"
 """What is said of a set-up that is wrong, or may be."""
 UNDONE = "; judged with that undone"
@@ -46,23 +53,6 @@ NEAR = 0.12
 sag and scatter of a printed arm take up half of it."""
 GAIN = 0.25
 """It must also be this much nearer than the set-up as it is, in the distance of that [-]."""
-
-
-def nowhere_near(twin: DigitalTwin, target: FloatArray, point: FloatArray) -> str:
-    """Return why settled poses may fit no hypothesis, and what to do about it, a clause.
-
-    Args:
-        twin: Kinematics as the profile has them.
-        target: Commanded angles, (pose, motor) [rad].
-        point: Settled tool positions, (pose, 3) [m].
-    """
-    setup = wrong_setup(twin, target, point)
-    if setup is not None:
-        return setup.told
-    return (
-        "in this run alone no unit, axis, frame, sense or exchange of columns explains it; a "
-        "spoilt sensor, another robot, or a fault beside a wrong set-up may"
-    )
 
 
 def wrong_setup(twin: DigitalTwin, target: FloatArray, point: FloatArray) -> SetUp | None:
