@@ -110,3 +110,16 @@ def test_inverse_of_positive_matrices(size):
     found = matrix.copy()
     assert invert(found) == pytest.approx(np.linalg.det(matrix))
     assert found == pytest.approx(np.linalg.inv(matrix))
+
+
+def test_an_outcome_whose_scale_no_double_holds_is_left_out():
+    """Its determinant is negative by rounding: the others, and the outlier, share the moment."""
+    residual, scale, weight, covariance = moment(np.random.default_rng(3))
+    noise = Noise.of(dof=5.0, dims=3, log_outlier=-2.5)
+    scale[1] = -covariance - 1e-6 * np.eye(3)
+    found = says(residual, scale, weight, np.zeros(3), covariance, noise)
+    kept = [0, 2, 3]
+    others = says(residual[kept], scale[kept], weight[kept], np.zeros(3), covariance, noise)
+    assert found.log_evidence == pytest.approx(others.log_evidence)
+    np.testing.assert_allclose(found.share, np.insert(others.share, 1, 0.0))
+    np.testing.assert_allclose(found.alpha, others.alpha)

@@ -265,7 +265,9 @@ def _write_glance(
             square, determinant = _whitened(
                 three, residual, scale, mean, covariance, a, 1.0, precision, pull
             )
-            glance[a] = log_weight[a] + log_density(noise, square, determinant)
+            said = log_weight[a] + log_density(noise, square, determinant)
+            if not np.isnan(said):  # else no double holds the scale beside what is known
+                glance[a] = said
         largest = max(largest, glance[a])
     return largest
 
