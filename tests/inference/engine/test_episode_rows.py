@@ -11,7 +11,7 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_of
 from failuretwin.failure_behavior.fault import draw_episodes
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.engine.episode_rows import ages
+from failuretwin.inference.engine.episode_rows import ages, begun
 from failuretwin.inference.engine.registration import robot_weighing
 from failuretwin.inference.engine.rows import Episodes
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -50,29 +50,47 @@ def test_ages_are_those_of_drawn_episodes():
 
 
 def test_share_and_onset_are_those_of_all_ways_to_stick():
+    """An episode begins with the onset; a fault from before the run may be in none."""
     rng = np.random.default_rng(5)
-    count, usual = 6, 0.4
-    held, sound, other = rng.uniform(0.05, 1.0, (3, count))
-    total = usual * held + (1.0 - usual) * sound + other
+    count, usual, age = 6, 0.4, np.array([0.7, 0.3])
+    held, (sound, other) = rng.uniform(0.05, 1.0, (count, 2)), rng.uniform(0.05, 1.0, (2, count))
+    begins = rng.uniform(0.1, 0.45, (count, 2))
+    total = usual * held @ age + (1.0 - usual) * sound + other
     prior, sizes = rng.dirichlet(np.ones(count)), np.array([0.2, 0.4, 0.7])
     nothing = np.zeros((1, count, 1))
     episodes = Episodes(
-        np.array([usual]), np.zeros(1) > 0, sizes, log_of(prior)[None], nothing, nothing
+        np.array([usual]),
+        np.array([-1, 0, 1]),
+        age,
+        begins[None],
+        sizes,
+        log_of(prior)[None],
+        nothing,
+        nothing,
     )
-    told = usual * held / total, (1.0 - usual) * sound / total
+    told = usual * held * age / total[:, None], (1.0 - usual) * sound / total
     expected = np.zeros((count, len(sizes)))
-    for (first, begun), (k, size) in product(enumerate(prior), enumerate(sizes)):
-        for ways in product((True, False), repeat=count):  # in an episode or not
-            weight = begun
+    for (first, early), (k, size) in product(enumerate(prior), enumerate(sizes)):
+        for ways in product((None, 0, 1), repeat=count):  # the age of an episode; None: in none
+            weight = early
             for m, sticks in enumerate(ways):
-                share = size if m >= first else 0.0
-                known = held[m] if sticks else sound[m]
-                there = share if sticks else 1.0 - share
-                weight *= there * known + there * other[m]
+                there = size * age if m >= first else np.zeros(2)
+                there = begins[m] if m == first > 0 else there
+                share = 1.0 - there.sum() if sticks is None else there[sticks]
+                known = sound[m] if sticks is None else held[m, sticks]
+                weight *= share * (known + other[m])
             expected[first, k] += weight
     assert episodes.posterior(0, 0, 0, told) == pytest.approx(expected / expected.sum(), rel=1e-9)
     later = expected * (np.arange(count) >= 2)[:, None]
     assert episodes.posterior(0, 0, 2, told) == pytest.approx(later / later.sum(), rel=1e-9)
+
+
+def test_an_episode_that_begins_in_a_gap_is_as_old_as_drawn_ones():
+    rng = np.random.default_rng(6)
+    for gap in (0.3, 1.1, 3.0):
+        old, length = rng.uniform(0.0, gap, 200_000), rng.uniform(0.5, 2.0, 200_000)
+        seen, _ = np.histogram(old[old < length], ages((0.5, 2.0))[0])
+        assert begun(np.array([gap]), (0.5, 2.0))[0] == pytest.approx(seen / 200_000, abs=0.005)
 
 
 @pytest.mark.parametrize("motor", [0, 1, 2])

@@ -19,9 +19,9 @@ from failuretwin.core.numerics import log_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.failure_behavior.mode import FaultMode, Range
 from failuretwin.inference.engine.moments import Moments
-from failuretwin.inference.engine.offset_rows import moment_intervals
 from failuretwin.inference.engine.outcomes import Outcomes
 from failuretwin.inference.engine.rows import Episodes, Rows, Scene, sampled
+from failuretwin.inference.faults.priors import OnsetIntervals
 
 EARLY_SHARES, SHARES = 4, 2
 """Shares of the time that episodes fill, to sum over: of a fault from before the run, and of one
@@ -41,7 +41,9 @@ def episode_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
         mode: Its mode, whose size is the share of time.
     """
     moments = scene.moments
-    intervals, early = moment_intervals(scene), scene.priors.onset.before_run(mode.mode)
+    earlier = np.concatenate([np.zeros_like(moments.time[:, :1]), moments.time[:, :-1]], axis=1)
+    intervals = OnsetIntervals(earlier, moments.time)  # a motor that stands shows it at once
+    early = scene.priors.onset.before_run(mode.mode)
     number = np.r_[EARLY_SHARES, np.full(moments.count - 1, SHARES)]
     first = np.repeat(np.arange(moments.count), number)
     share = np.concatenate([_middles(*mode.considered, count) for count in number.tolist()])
@@ -64,7 +66,9 @@ def episode_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
         onsets=sampled(onset[:, first], part[:, first]),
         episodes=Episodes(
             share,
-            np.r_[np.zeros(usual), np.ones(AGES)] > 0.0,
+            np.r_[np.full(usual, -1), np.arange(AGES)],
+            probability,
+            begun(intervals.length, mode.episode_s),
             _middles(*mode.considered, NODES),
             log_of(weight),
             onset,
@@ -84,6 +88,20 @@ def ages(length_s: Range) -> tuple[FloatArray, FloatArray]:
     middle = 0.5 * (edges[1:] + edges[:-1])
     lasts = np.clip((high - middle) / max(high - low, 1e-9), 0.0, 1.0)
     return edges, lasts / lasts.sum()
+
+
+def begun(gap_s: FloatArray, length_s: Range) -> FloatArray:
+    """Return how probable it is that an episode has begun in a gap and lasts, (..., age).
+
+    Args:
+        gap_s: Gaps in which one begins at any time, (...) [s].
+        length_s: Range of the lengths of episodes, uniform [s].
+    """
+    low, high = length_s
+    edges, gap = np.linspace(0.0, high, AGES + 1), np.maximum(gap_s, 1e-9)[..., None]
+    within = np.clip(np.minimum(edges[1:], gap) - edges[:-1], 0.0, None)
+    lasts = np.clip((high - edges[:-1] - 0.5 * within) / max(high - low, 1e-9), 0.0, 1.0)
+    return np.asarray(lasts * within / gap)
 
 
 def _middles(low: float, high: float, count: int) -> FloatArray:

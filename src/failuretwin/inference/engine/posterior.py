@@ -132,11 +132,8 @@ def _of_episodes(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArr
     rows, one = evidence.rows[h], evidence.weighed[h]
     assert rows.episodes is not None
     picks, found = one.picks[some], one.found.share[some]
-    kept = evidence.part(h, picks).kept
-    held = np.where(rows.episodes.held[kept], found, 0.0).sum(axis=-1)
-    arrived = np.where(kept == 0, found, 0.0).sum(axis=-1)
     usable = evidence.scene.moments.usable[picks.run]
-    told = np.where(usable, held, 0.0), np.where(usable, arrived, 0.0)
+    told = rows.episodes.told(evidence.part(h, picks).kept, np.where(usable[..., None], found, 0.0))
     parts = [
         rows.episodes.posterior(run, row, int(rows.first[row]), (p, q))
         for run, row, p, q in zip(picks.run.tolist(), picks.row.tolist(), *told, strict=True)

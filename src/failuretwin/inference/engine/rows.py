@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from failuretwin.core.numerics import log_of, log_sum
-from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.inference.engine.integral import Noise
 from failuretwin.inference.engine.moments import Moments
 from failuretwin.inference.engine.outcomes import Outcomes
@@ -52,16 +52,24 @@ class Drawn:
 class Episodes:
     """A motor that sticks with a share s of the time, from an onset on.
 
-    Of a row with the share s_0, in which a moment was in an episode with probability p, and all
-    commands arrived in it with q, another share changes what the moment says by
+    Of a row with the share s_0, in which a moment was in an episode of age a with probability p_a,
+    of p in all, and all commands arrived in it with q, another share changes what it says by
 
         p s / s_0 + q (1 - s) / (1 - s_0) + 1 - p - q
 
-    and an onset after it by the same with s = 0.
+    and an onset after it by the same with s = 0. An episode begins with the onset: by
+
+        sum over a of p_a b_a / (s_0 P_a) + q (1 - sum b_a) / (1 - s_0) + 1 - p - q
+
+    if the moment is the first that the fault affects, and the fault is not from before the run.
 
     Attributes:
         share: s_0 of each row, (row,).
-        held: Which outcomes are in an episode, (outcome,); the first is that all commands arrive.
+        age: Age of each outcome in an episode, (outcome,); -1 of the others, of which the first is
+            that all commands arrive.
+        usual: P_a, probability of each age in an episode, (age,).
+        begun: b_a, probability that a moment is in an episode of that age which began since the
+            moment before, (run, moment, age).
         sizes: Shares that are told, of the same prior probability, (size,).
         log_first: Log prior that each moment is the first affected, (run, moment).
         onset: Samples of the onset before each, (run, moment, sample) [s].
@@ -69,11 +77,24 @@ class Episodes:
     """
 
     share: FloatArray
-    held: BoolArray
+    age: IntArray
+    usual: FloatArray
+    begun: FloatArray
     sizes: FloatArray
     log_first: FloatArray
     onset: FloatArray
     part: FloatArray
+
+    def told(self, kept: IntArray, share: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return p_a (..., age) and q (...) of moments.
+
+        Args:
+            kept: Index of each outcome, (..., outcome).
+            share: Its share, same axes.
+        """
+        found = [np.where(self.age[kept] == age, share, 0.0) for age in range(len(self.usual))]
+        held = np.stack([one.sum(axis=-1) for one in found], axis=-1)
+        return held, np.where(kept == 0, share, 0.0).sum(axis=-1)
 
     def posterior(
         self, run: int, row: int, first: int, outcomes: tuple[FloatArray, FloatArray]
@@ -84,15 +105,19 @@ class Episodes:
             run: Index of the run.
             row: Index of the row.
             first: Its first moment affected: no earlier one is told.
-            outcomes: p and q, (moment,) each.
+            outcomes: p_a (moment, age) and q (moment,).
         """
-        (held, arrived), usual = outcomes, self.share[row]
-        other = np.maximum(1.0 - held - arrived, 0.0)[:, None]
-        sound = arrived[:, None] / (1.0 - usual)
-        after = log_of(held[:, None] * self.sizes / usual + sound * (1.0 - self.sizes) + other)
-        before = log_of(sound + other)
+        (held, arrived), usual, begun = outcomes, self.share[row], self.begun[run]
+        told = held.sum(axis=1)
+        other, sound = np.maximum(1.0 - told - arrived, 0.0), arrived / (1.0 - usual)
+        after = told[:, None] * self.sizes / usual + sound[:, None] * (1.0 - self.sizes)
+        after = log_of(after + other[:, None])
+        before = log_of(sound + other)[:, None]
+        begins = np.sum(held * begun / self.usual, axis=1) / usual
+        begins = log_of(begins + sound * (1.0 - begun.sum(axis=1)) + other)[:, None]
         so_far = np.cumsum(before - after, axis=0) - (before - after)
         joint = so_far + after.sum(axis=0) + self.log_first[run][:, None]
+        joint[1:] += (begins - after)[1:]
         joint[:first] = -np.inf
         return np.asarray(np.exp(joint - log_sum(joint.ravel(), axis=0)))
 
