@@ -65,6 +65,16 @@ def test_no_motor_is_named_where_two_explain_movements_or_none_does(tmp_path):
     assert lone_motor(likelihood, 0, likelihood.usable[0]) == ""
 
 
+def test_a_run_with_errors_beyond_those_that_are_considered_names_its_motor(tmp_path):
+    """Thirty degrees or more, where the paper has up to ten."""
+    file = tmp_path / "modes.toml"
+    file.write_text("[steady_state_error]\nmagnitude = [0.5, 0.7]\n")
+    truth = "motor_2:steady_state_error"
+    runs = ft.simulate(ft.Plan("armpi_fpv", [truth], 1, 1, modes=load_modes(file)))
+    (found,) = ft.diagnose(runs, hypotheses=["healthy", truth, "motor_1:stuck", "motor_3:stuck"])
+    assert "motor 2 alone explains it, up to " in found.undecided
+
+
 @pytest.mark.slow
 def test_an_unknown_run_has_a_residual_and_a_known_one_none(tmp_path):
     diagnoser, runs = seen(tmp_path, "motor_3", -0.15, ("healthy", "motor_1:stuck", "unknown"))

@@ -245,8 +245,7 @@ def _why_nowhere(likelihood: RunLikelihood, run: int, unexplained: BoolArray) ->
     setup = wrong_setup(likelihood.model.twin, target, point)
     if setup is not None:
         return setup.told
-    alone = "" if evidence.on_the_way[run] else lone_motor(likelihood, run, unexplained)
-    return alone or NOTHING_SIMPLE
+    return lone_motor(likelihood, run, unexplained) or NOTHING_SIMPLE
 
 
 NEVER_AT_REST = (
@@ -330,7 +329,8 @@ class Posterior:
         """
         best = int(np.argmax(self.log_posterior[run]))
         if self.no_verdict and self.no_verdict[run] and not quality.fatal:
-            return self.no_verdict[run]
+            alone = lone_motor(self.likelihood, run, self.likelihood.usable[run])
+            return "; ".join(filter(None, (self.no_verdict[run], alone)))
         known = self.explained
         explained = self.weights[best].settled(run) if known is None else known[run]
         return abstention_reason(

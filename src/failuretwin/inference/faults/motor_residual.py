@@ -35,6 +35,8 @@ def lone_motor(likelihood: RunLikelihood, run: int, movements: BoolArray) -> str
         movements: The movements, (movement,).
     """
     model = likelihood.model
+    if likelihood.evidence.on_the_way[run] or not movements.any():
+        return ""
     says = [_log_evidence(one)[run, movements] for one in likelihood.findings.profiles]
     total = np.array([one.max(axis=1).sum() for one in says])
     motor = int(np.argmax(total))
