@@ -46,6 +46,19 @@ def faulty_run(name):
     return run(name, motor_1__stuck=0.999)
 
 
+LARGE = "nothing explains it; motor 2 alone explains it, up to +34 deg off: more than considered"
+
+
+def test_healthy_runs_do_not_hide_one_that_a_motor_alone_explains():
+    found = robot_state([run("1", healthy=1.0), run("2", LARGE), run("3", healthy=1.0)], ROBOT)
+    assert found.state.kind == OPEN_STATE
+    assert found.headline.endswith("no fault that is considered explains 1 of 3 runs")
+    assert found.remark == "motor 2 alone explains it, up to +34 deg off"
+    assert "`--hypotheses` with drift or unknown" in found.step
+    sure = robot_state([faulty_run("1"), run("2", LARGE), faulty_run("3")], ROBOT)
+    assert (sure.state.kind, sure.state.motors) == (FAULTY_STATE, ("motor_1",))
+
+
 def test_runs_that_agree_are_never_surer_together_than_the_surest():
     chances = (0.97, 0.99, 0.96)
     runs = [run(f"{i}", motor_2__stuck=p) for i, p in enumerate(chances)]

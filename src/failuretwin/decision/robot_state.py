@@ -10,6 +10,7 @@ because their common errors, such as those of the calibration, do not average ou
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -48,7 +49,7 @@ from failuretwin.inference.explanation import (
 )
 from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.set_ups.set_ups import FAULT_OF_EVERY_RUN
-from failuretwin.inference.set_ups.wrong_setup import MAY_MISFIT
+from failuretwin.inference.set_ups.wrong_setup import ALONE, MAY_MISFIT
 from failuretwin.inference.together.fault_course import FaultCourse
 
 SUSPECT = 0.05
@@ -67,6 +68,8 @@ ZERO_STEP = (
     "is a fault: stop and repair the motor."
 )
 
+LONE_MOTOR = re.compile(rf"motor \d+[^;:]* {ALONE}[^;:]*")
+"""Which motor alone explains a run, in why there is no verdict on it."""
 SET_UP_HEADLINE = "Healthy, but its set-up is uncertain"
 SET_UP_STEP = "Put the set-up right first, and diagnose the same log again: {doubt}."
 SET_UP_TOO = "Look at the set-up too: {doubt}."
@@ -196,6 +199,7 @@ def robot_state(
         found = _one_by_one(diagnoses, states, decided, robot, learned is None)
     quality = [line for d in diagnoses for line in d.quality]
     found = _with_zero(found, [*quality, *(learned or ())])
+    found = _with_lone_motor(found, diagnoses) if decided else found
     found = _with_set_up(found, set_up_doubt(quality)) if decided else found
     return replace(
         found,
@@ -222,6 +226,21 @@ def _with_zero(found: RobotState, lines: Sequence[str]) -> RobotState:
     remark = "; ".join(filter(None, (found.remark, remarks[-1])))
     headline = "Cannot tell yet; healthy, but for a zero that may be a fault"
     return replace(found, state=State(OPEN_STATE), headline=headline, step=ZERO_STEP, remark=remark)
+
+
+def _with_lone_motor(found: RobotState, diagnoses: Sequence[Diagnosis]) -> RobotState:
+    """Return a state that names the motor which alone explains runs that no fault does.
+
+    A fault that other runs show for sure comes before it.
+    """
+    lone = [clause for d in diagnoses for clause in LONE_MOTOR.findall(d.undecided)]
+    if not lone or found.state.kind == FAULTY_STATE:
+        return found
+    runs = f"{len(lone)} of {counted(len(diagnoses), 'run')}"
+    remark = "; ".join(filter(None, (found.remark, lone[0])))
+    headline = f"Cannot tell yet; no fault that is considered explains {runs}"
+    step = undecided_step(lone[0])
+    return replace(found, state=State(OPEN_STATE), headline=headline, step=step, remark=remark)
 
 
 def _with_set_up(found: RobotState, doubt: str) -> RobotState:
