@@ -169,7 +169,7 @@ def test_an_alarm_that_changes_its_motor_is_none(twin):
     causes = ["motor_1:stuck", "motor_3:stuck", "motor_2:stuck"]
     alarms = [Alarm(RAISED, c, Episode(k + 1, c, 9.0 * k)) for k, c in enumerate(causes)]
     assert [watch.against(alarm) for alarm in alarms[:2]] == ["", ""]
-    assert "changes (motor 1, then motor 3, then motor 2)" in watch.against(alarms[2])
+    assert "changes (motor 1 and motor 3 and motor 2)" in watch.against(alarms[2])
     assert watch.against(Alarm()) == ""
     assert watch.against(alarms[0]) == ""
 
@@ -180,3 +180,19 @@ def test_an_error_is_not_blamed_on_the_first_movements(twin):
     for cause, said in (("motor_1:steady_state_error", True), ("motor_1:stuck", False)):
         alarm = Alarm(RAISED, cause, Episode(1, cause, 3.0))
         assert ("a few movements more tell" in watch.against(alarm)) == said
+
+
+@pytest.mark.parametrize("fitted", [True, False])
+def test_motors_that_are_blamed_in_turn_are_named_once(twin, fitted):
+    """Where the log has fitted the profile, it is not the profile that is doubted."""
+    watch = SetUpWatch(BayesDiagnoser(twin))
+    watch._fitted, watch._runs.begun = fitted, 50
+    told = [
+        watch.against(Alarm(RAISED, cause, Episode(number, cause, 10.0 * number)))
+        for number, cause in enumerate(3 * ["motor_1:stuck", "motor_3:stuck"], 1)
+    ]
+    assert told[:2] == ["", ""]
+    assert len(set(told[2:])) == 1
+    assert "motor 1 and motor 3" in told[-1]
+    assert ("in turn: two faults" in told[-1]) == fitted
+    assert ("the log does not fit" in told[-1]) != fitted

@@ -221,7 +221,12 @@ class SetUpWatch:
         if self.finding and not (is_held(alarm.cause) and self._may_be_a_zero):
             return self.finding
         if len(self._blamed) > CHANGES:
-            named = ", then ".join(motor.replace("_", " ") for motor in self._blamed)
+            named = " and ".join(m.replace("_", " ") for m in dict.fromkeys(self._blamed))
+            if self._fitted:
+                return (
+                    f"{named} are blamed in turn: two faults at once look like this, and so does "
+                    "a sensor that was moved"
+                )
             return (
                 f"{MISFITS}: the motor that is blamed changes ({named}), "
                 "and no mistake that is known explains it"
