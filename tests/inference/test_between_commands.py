@@ -10,7 +10,7 @@ import failuretwin as ft
 from failuretwin.app.commands.options import RobotOptions
 from failuretwin.app.reports.isolability_report import isolability_summary, onset_lines
 from failuretwin.connection.tracked_diagnosis import History, begin, diagnose_tracked
-from failuretwin.core.runs import concatenate
+from failuretwin.core.runs import concatenate, run_set
 from failuretwin.digital_model.robot import load_robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.set_up_weighing import SetUpWeighing
@@ -60,6 +60,25 @@ def test_curves_told_seldom_are_undecided_without_a_search(fault, every_s, tmp_p
     assert "readings" not in found.verdict
     assert found.explanation == ("Log again, with commands at 10 Hz or more.",)
     assert isolability_summary(runs, ft.BayesDiagnoser(ROBOT, "generic")) == []
+
+
+@pytest.mark.parametrize("seed", [4, 26])
+def test_strokes_that_are_told_all_along_are_judged(seed):
+    """All motors turn least in the middle of a stroke: that is no corner of their commands."""
+    rng, time = np.random.default_rng(seed), 0.008 * np.arange(1251)
+    ends = np.r_[0.0, np.cumsum(rng.uniform(1.0, 2.0, 14))]
+    goals = rng.uniform(-0.7, 0.7, (15, 4))
+    stroke = np.searchsorted(ends, time, side="right") - 1
+    share = ((time - ends[stroke]) / np.diff(ends)[stroke])[:, None]
+    share = 0.5 * share + 0.5 * share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    command = goals[stroke] + share * (goals[stroke + 1] - goals[stroke])
+    followed = command.copy()
+    followed[270:, 0] = followed[270, 0]
+    tool = DigitalTwin(ROBOT).path(followed)
+    tool[np.arange(len(tool)) % 12 > 0] = np.nan
+    runs = run_set(time, command, tool)
+    (found,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=(*OFFERED, "motor_1:stuck"))
+    assert found.diagnosis == "motor_1:stuck"
 
 
 @pytest.mark.parametrize("together", ["as a folder", "as a life"])

@@ -13,8 +13,6 @@ Section: docs/inference.md#moments
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from failuretwin.core.types import BoolArray, FloatArray
@@ -63,11 +61,11 @@ def strays_between(
     found: BoolArray = np.zeros(len(runs), dtype=bool)
     for run in np.flatnonzero(runs).tolist():
         command, time = evidence.command, evidence.time
-        corners = _corners(command[run], time)
-        steady = len(corners) > FEWEST and _steady(corners)
+        stretches = _stretches(command[run], time)
+        length = np.diff(stretches, axis=1)[:, 0]
+        steady = len(length) >= FEWEST and _steady(length)
         least, share = (LEAST_STEADY_S, SHARE_STEADY) if steady else (LEAST_S, SHARE)
-        long = np.array([pair for pair in pairwise(corners.tolist()) if pair[1] - pair[0] >= least])
-        middle, ends, deviation = _off(evidence, model, run, lag_s, long.reshape(-1, 2))
+        middle, ends, deviation = _off(evidence, model, run, lag_s, stretches[length >= least])
         if len(middle) >= FEWEST:
             strays = (middle > STRAYS * ends) & (middle > SEEN * deviation)
             found[run] = strays.mean() >= share
@@ -100,15 +98,19 @@ def _off(
     return middles, ends, deviations
 
 
-def _corners(command: FloatArray, time: FloatArray) -> FloatArray:
-    """Return when any motor's command (time, motor) turns a corner, and its ends, (corner,) [s]."""
+def _stretches(command: FloatArray, time: FloatArray) -> FloatArray:
+    """Return where no motor's command (time, motor) turns, begin and end, (stretch, 2) [s].
+
+    A curve turns at every sample: it has none.
+    """
     speed = np.diff(command, axis=0) / np.diff(time)[:, None]
     turns = np.abs(np.diff(speed, axis=0)).max(axis=1) > CORNER_RAD_S
     corners = np.concatenate([time[:1], time[1:-1][turns], time[-1:]])
-    return corners[np.diff(corners, prepend=-np.inf) > SAME_CORNER_S]
+    pairs = np.stack([corners[:-1], corners[1:]], axis=1)
+    return np.asarray(pairs[np.diff(corners) > SAME_CORNER_S])
 
 
-def _steady(corners: FloatArray) -> bool:
-    """Return whether nearly all stretches between corners last equally long."""
-    low, middle, high = np.quantile(np.diff(corners), [0.1, 0.5, 0.9])
+def _steady(length: FloatArray) -> bool:
+    """Return whether nearly all stretches last equally long, (stretch,) [s]."""
+    low, middle, high = np.quantile(length, [0.1, 0.5, 0.9])
     return bool(max(high - middle, middle - low) <= STEADY * middle)
