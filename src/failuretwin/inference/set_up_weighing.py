@@ -29,6 +29,7 @@ from failuretwin.inference.engine.registration import (
 from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.engine.theta import offset_deviation, offsets_doubted
 from failuretwin.inference.engine.weighing import Weighing
+from failuretwin.inference.faults.motor_residual import EXPLAINED
 from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import highest_and_outlier
@@ -49,9 +50,9 @@ FAR = 0.08
 """A frame that moves the tool by less than this share of the reach is a matter of registration."""
 CHOICE_NATS = 12.0
 """What seven numbers of a registration, chosen anew for each run, cost of its evidence [nats]."""
-EXPLAINED, CLUSTER, OFF, AGREEING = 25.0, 3.0, 2.0, 0.2
+CLUSTER, OFF, AGREEING = 3.0, 2.0, 0.2
 """A zero is weighed where such a share of the movements agrees on it within `CLUSTER` deviations,
-and it is off by `OFF`: only movements count that one motor explains, by D0^2."""
+and it is off by `OFF`: only movements count that one motor explains."""
 RIGHT = 2
 """Movements of a run in which a motor stands right show that its zero is."""
 ZEROS_RAD = tuple(np.deg2rad([z for z in range(-15, 16) if z]).tolist())

@@ -83,10 +83,8 @@ def ages(length_s: Range) -> tuple[FloatArray, FloatArray]:
     Args:
         length_s: Range of the lengths of episodes, uniform [s].
     """
-    low, high = length_s
-    edges = np.linspace(0.0, high, AGES + 1)
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    lasts = np.clip((high - middle) / max(high - low, 1e-9), 0.0, 1.0)
+    edges = np.linspace(0.0, length_s[1], AGES + 1)
+    lasts = _lasts(0.5 * (edges[1:] + edges[:-1]), length_s)
     return edges, lasts / lasts.sum()
 
 
@@ -97,11 +95,15 @@ def begun(gap_s: FloatArray, length_s: Range) -> FloatArray:
         gap_s: Gaps in which one begins at any time, (...) [s].
         length_s: Range of the lengths of episodes, uniform [s].
     """
-    low, high = length_s
-    edges, gap = np.linspace(0.0, high, AGES + 1), np.maximum(gap_s, 1e-9)[..., None]
+    edges, gap = ages(length_s)[0], np.maximum(gap_s, 1e-9)[..., None]
     within = np.clip(np.minimum(edges[1:], gap) - edges[:-1], 0.0, None)
-    lasts = np.clip((high - edges[:-1] - 0.5 * within) / max(high - low, 1e-9), 0.0, 1.0)
-    return np.asarray(lasts * within / gap)
+    return np.asarray(_lasts(edges[:-1] + 0.5 * within, length_s) * within / gap)
+
+
+def _lasts(age_s: FloatArray, length_s: Range) -> FloatArray:
+    """Return P(L > a) of ages a, (age,) [s]."""
+    low, high = length_s
+    return np.asarray(np.clip((high - age_s) / max(high - low, 1e-9), 0.0, 1.0))
 
 
 def _middles(low: float, high: float, count: int) -> FloatArray:

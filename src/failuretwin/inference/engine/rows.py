@@ -67,7 +67,7 @@ class Episodes:
         share: s_0 of each row, (row,).
         age: Age of each outcome in an episode, (outcome,); -1 of the others, of which the first is
             that all commands arrive.
-        usual: P_a, probability of each age in an episode, (age,).
+        of_age: P_a, probability of each age in an episode, (age,).
         begun: b_a, probability that a moment is in an episode of that age which began since the
             moment before, (run, moment, age).
         sizes: Shares that are told, of the same prior probability, (size,).
@@ -78,7 +78,7 @@ class Episodes:
 
     share: FloatArray
     age: IntArray
-    usual: FloatArray
+    of_age: FloatArray
     begun: FloatArray
     sizes: FloatArray
     log_first: FloatArray
@@ -92,7 +92,7 @@ class Episodes:
             kept: Index of each outcome, (..., outcome).
             share: Its share, same axes.
         """
-        found = [np.where(self.age[kept] == age, share, 0.0) for age in range(len(self.usual))]
+        found = [np.where(self.age[kept] == age, share, 0.0) for age in range(len(self.of_age))]
         held = np.stack([one.sum(axis=-1) for one in found], axis=-1)
         return held, np.where(kept == 0, share, 0.0).sum(axis=-1)
 
@@ -113,7 +113,7 @@ class Episodes:
         after = told[:, None] * self.sizes / usual + sound[:, None] * (1.0 - self.sizes)
         after = log_of(after + other[:, None])
         before = log_of(sound + other)[:, None]
-        begins = np.sum(held * begun / self.usual, axis=1) / usual
+        begins = np.sum(held * begun / self.of_age, axis=1) / usual
         begins = log_of(begins + sound * (1.0 - begun.sum(axis=1)) + other)[:, None]
         so_far = np.cumsum(before - after, axis=0) - (before - after)
         joint = so_far + after.sum(axis=0) + self.log_first[run][:, None]
