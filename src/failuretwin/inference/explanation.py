@@ -47,6 +47,10 @@ WRONG_SETUP_ADVICE = (
 )
 
 
+NO_HYPOTHESIS = "is none of the hypotheses"
+"""Said of a fault that nobody asked for."""
+
+
 def percent(probability: float) -> str:
     """Return a probability in per cent that never claims certainty."""
     if probability > 0.999:
@@ -230,6 +234,8 @@ def undecided_step(reason: str) -> str:
         return LARGE_FAULT_ADVICE
     if NOWHERE in reason:
         return WRONG_SETUP_ADVICE
+    if NO_HYPOTHESIS in reason:
+        return "Diagnose the log again with that fault among the hypotheses (`--hypotheses`)."
     if reason == TOO_SELDOM:
         return "Log again, with commands at 10 Hz or more."
     return "Log again, for five movements or more, with the tool in view while it rests."

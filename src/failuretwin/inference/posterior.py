@@ -300,6 +300,7 @@ class Posterior:
         log_settled: Log of the sum over hypotheses of p(h) p(settled positions | h), (run,); None:
             it was not asked for.
         no_verdict: Why no set-up allows a verdict on each run; empty: nothing keeps from any.
+        unasked: What explains each run better and is no hypothesis; empty: nothing does.
     """
 
     likelihood: RunLikelihood
@@ -312,6 +313,7 @@ class Posterior:
     explained: FloatArray | None = None
     log_settled: FloatArray | None = None
     no_verdict: Sequence[str] = ()
+    unasked: Sequence[str] = ()
 
     @property
     def settled_evidence(self) -> FloatArray:
@@ -331,6 +333,9 @@ class Posterior:
         if self.no_verdict and self.no_verdict[run] and not quality.fatal:
             alone = lone_motor(self.likelihood, run, self.likelihood.usable[run])
             return "; ".join(filter(None, (self.no_verdict[run], alone)))
+        faulty = bool(self.hypotheses[best].faults)
+        if faulty and self.unasked and self.unasked[run] and not quality.fatal:
+            return self.unasked[run]
         known = self.explained
         explained = self.weights[best].settled(run) if known is None else known[run]
         return abstention_reason(

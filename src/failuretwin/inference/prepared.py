@@ -81,7 +81,7 @@ class PreparedDiagnoser:
             rows = slice(first, first + chunk)
             says = [one.posterior(rows, way) for one, way in zip(seen, moving, strict=True)]
             likeliest = mixed(says, self.set_ups, rounding)
-            robots = seen[0].robots(likeliest, common, len(says) == 1 and self.set_ups.fits)
+            robots = seen[0].robots(likeliest, common, self.set_ups.fits)
             for at in range(len(names))[rows]:
                 posterior, row = robots.of_run(at - first)
                 results.append(posterior.to_diagnosis(row, names[at], quality[at], truth[at]))

@@ -214,6 +214,26 @@ def test_a_motor_that_follows_later_is_found_and_timed():
     more = [*hypotheses, "motor_2:intermittent", "motor_2:lost_commands"]
     (again,) = ft.diagnose(runs, ROBOT, "generic", hypotheses=more)
     assert str(again.diagnosis) == "motor_2:lag"  # not taken for one that sticks now and then
+    (unasked,) = ft.diagnose(runs, ROBOT, "generic")
+    assert unasked.undecided == "motor 2 late explains it better and is none of the hypotheses"
+    assert "--hypotheses" in " ".join(unasked.explanation)
+
+
+@pytest.mark.parametrize("stops", [((2.0, 3.5), (4.5, 6.0)), ((3.5, np.inf),)])
+def test_a_motor_that_goes_on_again_is_not_said_to_be_stuck(stops):
+    command, time = curve(), STEP_S * np.arange(len(curve()))
+    way = command.copy()
+    for begin, end in stops:
+        way[(time >= begin) & (time < end), 0] = np.interp(begin, time, command[:, 0])
+    runs, seen = late_run(command, 0.0), np.full((len(command), 3), np.nan)
+    seen[::10] = DigitalTwin(ROBOT).path(way[::10])
+    runs = runs.assign(measured=(runs["measured"].dims, seen[None]))
+    (found,) = ft.diagnose(runs, ROBOT, "generic")
+    if np.isfinite(stops[-1][1]):
+        assert "motor 1 sticks now and then explains it better" in found.undecided
+    else:
+        assert str(found.diagnosis) == "motor_1:stuck"
+        assert found.probability > 0.99
 
 
 def test_movements_of_a_curve_do_not_speak_for_what_does_not_show_on_it():

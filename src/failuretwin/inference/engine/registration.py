@@ -38,6 +38,7 @@ from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.registered import REGISTRATION
 from failuretwin.inference.posterior import Posterior, compute_posterior, marginal_likelihoods
 from failuretwin.inference.set_ups.setup_prior import SetupPrior
+from failuretwin.inference.unasked_faults import unasked_faults
 
 COARSE_TO_FINE = (0.026, 0.004, 0.0)
 """Noise added while a displaced sensor is registered, as shares of the reach."""
@@ -263,8 +264,13 @@ def robot_posterior(
     if known and likelihood.moving is not None:
         pairs = zip(known, chunks, strict=True)
         parts = [one.seen_moving(likelihood.moving[rows]) for one, rows in pairs]
-    some = [one.posterior() for one in _of_one_sensor(parts, SUSPECT_NATS)]
+    some = [_looked_further(one) for one in _of_one_sensor(parts, SUSPECT_NATS)]
     return assembled(likelihood, some, *_in_turn(chunks))
+
+
+def _looked_further(weighing: Weighing) -> Posterior:
+    """Return the posterior of runs with what explains them better and is no hypothesis."""
+    return replace(weighing.posterior(), unasked=unasked_faults(weighing))
 
 
 def robot_evidence(
@@ -299,7 +305,7 @@ def displaced_posterior(
 ) -> Posterior:
     """Return the posterior of runs whose sensor may be displaced."""
     parts, better = _about_the_better(likelihood, hypotheses, priors)
-    some = [one.posterior() for one in parts]
+    some = [_looked_further(one) for one in parts]
     chunks = _chunks(likelihood)
     part, row = _in_turn(chunks)
     return assembled(likelihood, some, part + len(chunks) * better, row)

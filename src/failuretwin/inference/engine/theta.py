@@ -159,6 +159,15 @@ class Components:
         """How many."""
         return len(self.sigma)
 
+    def of_runs(self, rows: IntArray) -> Components:
+        """Return what is believed of the robots of some runs."""
+        return replace(
+            self,
+            log_weight=self.log_weight[rows] if self.log_weight.ndim == 2 else self.log_weight,
+            mean=self.mean[rows] if self.mean.ndim == 3 else self.mean,
+            covariance=self.covariance[rows] if self.covariance.ndim == 4 else self.covariance,
+        )
+
     @property
     def unknown(self) -> IntArray:
         """Places in theta that are not known in every component, (place,)."""

@@ -464,5 +464,6 @@ def assembled(
         [weight(h) for h in range(len(first.hypotheses))],
         [parts[p].set_up[r] if parts[p].set_up else "" for p, r in places],
         [parts[p].offsets[r] if parts[p].offsets else "" for p, r in places],
+        unasked=[parts[p].unasked[r] if parts[p].unasked else "" for p, r in places],
         log_settled=np.array([parts[p].settled_evidence[r] for p, r in places]),
     )
