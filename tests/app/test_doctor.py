@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
+from failuretwin import load_robot
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
+from little_logs import exact_run
 
 WRONG = "set-up: the log does not fit the profile (over 99.9 % sure): motor 2 turns the other way"
 
@@ -20,6 +24,17 @@ def reversed_log(simulated, tmp_path_factory):
     path = tmp_path_factory.mktemp("reversed") / "log.nc"
     save_run_set(runs.assign(command=(runs["command"].dims, command)), path)
     return path
+
+
+def test_clocks_that_are_apart_show_on_the_way(failuretwin, tmp_path):
+    time, knots = 0.02 * np.arange(301), np.arange(0.0, 12.0, 0.9)
+    told = CubicSpline(knots, np.random.default_rng(7).uniform(-0.7, 0.7, (len(knots), 4)))
+    log, robot = tmp_path / "log.nc", load_robot("armpi_fpv")
+    save_run_set(exact_run(robot, told(time), told(time - 0.3), 0.02), log)
+    answer = failuretwin("doctor", log, "--calibration", "generic")
+    assert answer.returncode == 0, answer.stderr
+    (late,) = re.findall(r"the tool trails its commands by ([0-9.]+) s", answer.stdout)
+    assert float(late) == pytest.approx(0.3, abs=0.05)
 
 
 def test_a_log_that_fits_is_said_to_fit(failuretwin, simulated):

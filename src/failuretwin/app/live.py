@@ -151,9 +151,12 @@ def basis_line(known: CalibratedRobot, calibration: Path | None, budget: float, 
 def fit_of(monitor: FaultMonitor) -> str:
     """Return how well calibration and profile have fitted this robot, in one sentence."""
     fit = monitor.fit
-    taught = f"{fit.learned} movements taught how this robot is"
+    teachers = counted(fit.learned, "movement")
+    if fit.moments and not fit.learned:
+        teachers = f"{counted(fit.moments, 'moment')} on its way"
+    taught = f"{teachers} taught how this robot is"
     if fit.given:
-        own = f"; {taught}" if fit.learned else ""
+        own = f"; {taught}" if fit.learned or fit.moments else ""
         said = f"calibration {fit.given!r} is this robot's: {percent(fit.fits)} sure{own}"
     else:
         said = f"no calibration was given; {taught}"

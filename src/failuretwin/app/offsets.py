@@ -11,7 +11,7 @@ import numpy as np
 from failuretwin import __version__
 from failuretwin.app.inputs import stated_angles
 from failuretwin.connection.joint_offsets import JointOffset, joint_offsets
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import FAULTY_STATE, Diagnosis, Hypothesis
 from failuretwin.data_knowledge.readers.lerobot import (
     NOTE_FILE,
@@ -60,12 +60,29 @@ def offset_lines(
         for offset in offsets
         if offset.found
     ]
+    lines += _blamed_for(offsets, diagnoses, known.robot)
     if out is not None:
         angles = stated_angles(reading.columns)
         return [*lines, _corrected(reading.logs[0], out, known.robot, angles, offsets)]
     if lines:
         return [*lines, "--correct OUT writes a copy of the data set without it"]
     return [f"joint offsets: none found; {_judged(offsets, known.robot)}"]
+
+
+def _blamed_for(
+    offsets: Sequence[JointOffset], diagnoses: Sequence[Diagnosis], robot: Robot
+) -> list[str]:
+    """Return that verdicts may come from an offset, a line for each motor that they blame."""
+    lines = []
+    for motor in [offset.motor for offset in offsets if offset.found]:
+        runs = [one for one in diagnoses if (one.diagnosis or "").startswith(f"{motor}:")]
+        if any(one.state == FAULTY_STATE for one in runs):
+            named = joint_names_in(motor.replace("_", " "), robot)
+            lines.append(
+                f"{counted(len(runs), 'run')} may blame {named} for that offset alone: judge the "
+                "corrected copy"
+            )
+    return lines
 
 
 def _judged(offsets: Sequence[JointOffset], robot: Robot) -> str:

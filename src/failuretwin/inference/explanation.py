@@ -238,7 +238,10 @@ def undecided_step(reason: str) -> str:
         return "Diagnose the log again with that fault among the hypotheses (`--hypotheses`)."
     if reason == TOO_SELDOM:
         return "Log again, with commands at 10 Hz or more."
-    return "Log again, for five movements or more, with the tool in view while it rests."
+    return (
+        "Log again with the tool in view: five movements or more with rests, or half a minute of "
+        "motion."
+    )
 
 
 def set_up_doubt(lines: Iterable[str]) -> str:

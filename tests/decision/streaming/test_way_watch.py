@@ -72,6 +72,7 @@ def test_the_last_part_of_a_stream_counts_at_its_end():
     for sample in stream(17.0, 4, stuck_s=12.5, motor=0):
         answer = found.update(*sample)
     assert answer.alarm.state == CLEAR
+    assert found.fit.moments > 5
     answer = found.conclude()
     assert answer.alarm.state == RAISED
     assert answer.alarm.cause == STUCK

@@ -4,11 +4,13 @@ import json
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 import failuretwin as ft
 from failuretwin.connection.emulated_arm import EmulatedArm, Emulation
 from failuretwin.connection.links.base import Order
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
+from failuretwin.data_knowledge.store import save_run_set
 from failuretwin.decision.acting.belief import Judge, settled_evidence_of
 from failuretwin.decision.acting.believed_arm import Seen
 from failuretwin.decision.test_motions.design import next_movement
@@ -21,7 +23,8 @@ from failuretwin.decision.test_motions.health_check import (
     motor_offsets,
 )
 from failuretwin.decision.test_motions.motions import Motions, read_motions, write_motions
-from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.calibrated_robot import calibrated, load_calibration
+from failuretwin.digital_model.robot import load_robot
 from failuretwin.failure_behavior.injection import ScheduledFault
 from failuretwin.failure_behavior.modes import SteadyStateError
 from failuretwin.failure_behavior.registry import MODES
@@ -30,6 +33,7 @@ from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
+from little_logs import exact_run
 
 COUNT_RAD = np.deg2rad(0.24)
 
@@ -321,3 +325,17 @@ def test_in_one_call(known):
         found = ft.check(arm, seconds=8.0, tell=lambda _: None)
     assert (found.light, found.motor) == ("red", "motor_3")
     assert found.diagnosis.diagnosis == "motor_3:stuck"
+
+
+def test_zeros_of_a_log_without_rests_are_true(gate, tmp_path, monkeypatch):
+    robot, off = load_robot("armpi_fpv"), np.radians([1.5, 0.0, 0.0, 0.0])
+    time, knots = 0.02 * np.arange(501), np.arange(0.0, 12.0, 0.9)
+    told = CubicSpline(knots, np.random.default_rng(7).uniform(-0.7, 0.7, (len(knots), 4)))(time)
+    save_run_set(exact_run(robot, told, told + off, 0.02), tmp_path / "log.nc")
+    monkeypatch.setattr(Checking, "shown", lambda self, result, command, time: result)
+    known = calibrated(robot, "generic")
+    (found,) = Checking(known, gate).of_logs([tmp_path / "log.nc"])
+    assert found.on_the_way
+    away = (found.offsets.zero - off) / found.offsets.zero_sd
+    assert np.abs(away).max() < 2.5
+    assert np.degrees(found.offsets.zero_sd).max() < 3.0  # 5.7 before anything is seen

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 SHOWN = 5
 """Maximum number of different remarks that are listed."""
+TRAILS_S = 0.1
+"""By so much more than usual clocks that are apart show on the way [s]."""
 NAMED = 3
 """Maximum number of runs that are named after a remark."""
 
@@ -98,6 +100,8 @@ def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior, unfit: bool) -> list[str
     fits = fits_this_robot(undone) if set_ups.fits and not unfit else None
     if fits is not None:
         lines.insert(0, f"set-up: {calibration_told(undone.model.imperfections.name, fits)}")
+    if way and abs(undone.lag_s - undone.model.lag_s) > TRAILS_S:
+        lines.insert(0, f"set-up: {_trailing(undone.lag_s, undone.model.lag_s)}")
     lines += [f"log: {line}" for line in undone.rounding()]
     names = [str(name) for name in seen.runs["run"].values]
     where: dict[str, list[str]] = {}
@@ -109,6 +113,15 @@ def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior, unfit: bool) -> list[str
     if len(found) > SHOWN:
         lines.append(f"log: and {counted(len(found) - SHOWN, 'remark')} more")
     return lines if found else [*lines, "log: nothing is wrong with the readings"]
+
+
+def _trailing(lag_s: float, usual_s: float) -> str:
+    """Return that the tool trails its commands more or less than usual on its way."""
+    sense = "trails its commands by" if lag_s >= 0.0 else "is ahead of its commands by"
+    return (
+        f"on its way the tool {sense} {abs(lag_s):.2f} s (usual: {usual_s:.2f} s): the clocks of "
+        "commands and readings are apart, or every motor is late; allowed for"
+    )
 
 
 def _in_runs(named: Sequence[str], count: int) -> str:

@@ -37,7 +37,8 @@ def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[Part]
     if result.light == OPEN and not diagnosis.undecided:
         names = [name for name, p in result.by_motor.items() if p >= LIKELY]
         head += f". Ask {' and '.join(names)} further: --further 6" if names else ""
-    made = counted(result.movements, "movement") + " seen at rest"
+    seen = ("moment", "on the way") if result.on_the_way else ("movement", "seen at rest")
+    made = f"{counted(result.movements, seen[0])} {seen[1]}"
     made += f", {seconds:.0f} s planned" if seconds else ""
     if result.further:
         made += f", {counted(result.further, 'further movement')}"

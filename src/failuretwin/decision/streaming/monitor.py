@@ -65,12 +65,14 @@ class Fit:
         fits: Probability that it is this robot's; 0 without one.
         learned: Movements that this robot itself has taught.
         seen: Movements that have begun.
+        moments: Moments on its way, where it hardly rests, that it has taught.
     """
 
     given: str
     fits: float
     learned: int
     seen: int = 0
+    moments: int = 0
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,8 @@ class FaultMonitor(RobotStream):
         """Whose healthy behaviour the robot has, so far."""
         fits = float(np.exp(self._concluded.log_weight[0, 0])) if self._given else 0.0
         learned = 0 if self._learner is None else self._learner.movements
-        return Fit(self._given, fits, learned, self._set_up.movements)
+        moments = 0 if self._way is None else self._way.taught
+        return Fit(self._given, fits, learned, self._set_up.movements, moments)
 
     @property
     def life(self) -> LifeFilter | None:

@@ -78,6 +78,11 @@ class WayWatch:
         """Whether the log has been seen to fit the profile: what comes later is a fault."""
         return self.fitting >= FITTING
 
+    @property
+    def taught(self) -> int:
+        """Moments so far from which the robot is known."""
+        return self._life.movements
+
     def see(
         self,
         time: float,

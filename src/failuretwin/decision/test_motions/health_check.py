@@ -52,7 +52,6 @@ from failuretwin.inference.faults.prior_odds import log_prior
 from failuretwin.inference.faults.priors import Priors, visible_sizes
 from failuretwin.inference.isolability import IsolabilityReport, isolability
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
-from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.observation.log_quality import BEYOND_USUAL, LogQuality
 from failuretwin.inference.observation.settings import ERROR_STEPS, WIDEST_ERROR
@@ -155,7 +154,8 @@ class CheckResult:
     Attributes:
         diagnosis: Of all movements together.
         offsets: Zeros and play of the motors.
-        movements: Movements that were seen at rest.
+        movements: Movements that were seen at rest, or moments on the way of a run without rests.
+        on_the_way: Whether these are moments on the way.
         further: How many of the movements made were not planned before.
         shown: What its movements can show at all; None: not looked at.
     """
@@ -165,6 +165,7 @@ class CheckResult:
     movements: int
     further: int = 0
     shown: IsolabilityReport | None = None
+    on_the_way: bool = False
 
     @property
     def by_motor(self) -> Mapping[str, float]:
@@ -315,13 +316,13 @@ class Checking:
         runs = read_runs(list(paths), self.known.robot)
         known = self.known
         diagnoser = BayesDiagnoser(known.twin, known.imperfections, self.hypotheses, self.priors)
-        settled = Evidence(runs, self.model.settings).sound.settled
+        settled = diagnoser.seen(runs).settled
         command, time = as_floats(runs["command"].values), as_floats(runs["time"].values)
         results = []
         for row, diagnosis in enumerate(diagnoser.diagnose(runs)):
-            part = slice(row, row + 1)
-            result = self._result(RunLikelihood(settled[part], self.model), diagnosis)
-            results.append(self.shown(result, command[part], time))
+            likelihood = RunLikelihood(settled.alike(np.array([row])), self.model)
+            result = self._result(likelihood, diagnosis)
+            results.append(self.shown(result, command[row : row + 1], time))
         return results
 
     # Movements on an arm.
@@ -378,7 +379,9 @@ class Checking:
         remarks = tuple(line for line in diagnosis.quality if not line.startswith(BEYOND_USUAL))
         offsets = motor_offsets(likelihood, self.hypotheses, self.priors)
         movements = int(likelihood.usable.sum())
-        return CheckResult(replace(diagnosis, quality=remarks), offsets, movements, further)
+        diagnosis = replace(diagnosis, quality=remarks)
+        on_the_way = bool(likelihood.evidence.on_the_way.any())
+        return CheckResult(diagnosis, offsets, movements, further, on_the_way=on_the_way)
 
 
 def check(
