@@ -394,6 +394,13 @@ def test_why_nothing_can_be_said_is_told_once(armpi):
     ]
 
 
+def test_an_alarm_stands_though_its_fault_is_in_doubt(armpi):
+    other = Diagnosis("live", {"healthy": 1.0}, undecided="motor 3 late explains it better")
+    raised, changes = Alarm(RAISED, CAUSE, LASTS), Changes(armpi.motor_names)
+    moments = [moment(1.0, OK, STUCK, raised), moment(2.0, OK, other, raised)]
+    assert lines(changes, moments)[1:] == ["ALARM: motor 3 late explains it better"]
+
+
 def test_trouble_with_the_link_is_told(armpi):
     changes = Changes(armpi.motor_names)
     still = moment(0.0, OK, None)

@@ -21,7 +21,7 @@ from failuretwin.connection.links.base import (
     Sink,
     Source,
 )
-from failuretwin.connection.links.statuses import UNDECIDED, is_sure, statuses
+from failuretwin.connection.links.statuses import Status, is_sure, statuses
 from failuretwin.connection.links.stream_time import LiveReference, ReorderBuffer, StreamClock
 from failuretwin.core.hypothesis import CLEAR, RAISED, SUSPECTED, Alarm, Hypothesis
 from failuretwin.core.types import FloatArray
@@ -302,10 +302,11 @@ class Changes:
         answer = snapshot.answer
         if answer.state == STALE or answer.diagnosis is None:
             return []
-        undecided, self._undecided = self._undecided, answer.diagnosis.undecided
-        if self._undecided:
+        undecided, why, arm = self._undecided, answer.diagnosis.undecided, self._arm(answer)
+        self._undecided = f"{arm.state}: {why}" if why else ""
+        if why:
             same = FIGURE.sub("", self._undecided) == FIGURE.sub("", undecided)
-            return [] if same else [f"{UNDECIDED}: {self._undecided}"]
+            return [] if same else [self._undecided]
         before, now = self._alarm, answer.alarm
         same = before is not None and (before.state, before.cause) == (now.state, now.cause)
         sure = now.state == RAISED and is_sure(answer.diagnosis)
@@ -313,13 +314,16 @@ class Changes:
         self._alarm, self._sure = now, sure or (same and self._sure)
         if told:
             return []
-        arm = statuses(answer, self._motors)[0]
         if now.state == RAISED and (before is None or before.state != RAISED):
             self._recurrence.count(now, snapshot.stream_time)
             return [str(arm), *self.recurring]
         if before is None or same or now.state != CLEAR:
             return [str(arm)]
         return [f"{_cleared(before, now)}; {arm.message}"]
+
+    def _arm(self, answer: Answer) -> Status:
+        """Return the status of the whole arm."""
+        return statuses(answer, self._motors)[0]
 
     def _link(
         self, at: float, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]

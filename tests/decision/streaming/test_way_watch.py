@@ -16,8 +16,8 @@ HEALTHY, STUCK, OFF = "healthy", "motor_1:stuck", "motor_2:steady_state_error"
 FEW = [HEALTHY, OFF, "motor_3:stuck", "motor_3:steady_state_error"]
 
 
-def stream(seconds, seed, stuck_s=np.inf, motor=1, off_s=np.inf, off_rad=0.1):
-    """Yield time, command and reading of a smooth motion; a motor may stop or go off."""
+def stream(seconds, seed, stuck_s=np.inf, motor=1, off_s=np.inf, off_rad=0.1, late_s=np.inf):
+    """Yield time, command and reading of a smooth motion; a motor may stop, go off or be late."""
     rng = np.random.default_rng(seed)
     knots = np.arange(-1.0, seconds + 2.0, 0.9)
     told = CubicSpline(knots, rng.uniform(-0.7, 0.7, (len(knots), 4)))
@@ -26,6 +26,8 @@ def stream(seconds, seed, stuck_s=np.inf, motor=1, off_s=np.inf, off_rad=0.1):
         time = k * STEP_S
         command, seen = told(time), told(time - LAG_S)
         seen[motor] += off_rad * (time >= off_s)
+        if time >= late_s:
+            seen[motor] = told(time - LAG_S - 0.25)[motor]
         if time >= stuck_s:
             held = seen[motor] if held is None else held
             seen[motor] = held
@@ -76,6 +78,15 @@ def test_the_last_part_of_a_stream_counts_at_its_end():
     answer = found.conclude()
     assert answer.alarm.state == RAISED
     assert answer.alarm.cause == STUCK
+
+
+def test_a_motor_that_is_late_is_told_where_nobody_asked_for_it():
+    found = watching(FEW)
+    for sample in stream(39.0, 3, motor=2, late_s=18.0):
+        answer = found.update(*sample)
+    assert answer.alarm.state == RAISED
+    assert answer.alarm.cause.startswith("motor_3")
+    assert answer.diagnosis.undecided.startswith("motor 3 late explains it better")
 
 
 def test_an_error_that_comes_is_named():

@@ -264,11 +264,11 @@ def robot_posterior(
     if known and likelihood.moving is not None:
         pairs = zip(known, chunks, strict=True)
         parts = [one.seen_moving(likelihood.moving[rows]) for one, rows in pairs]
-    some = [_looked_further(one) for one in _of_one_sensor(parts, SUSPECT_NATS)]
+    some = [looked_further(one) for one in _of_one_sensor(parts, SUSPECT_NATS)]
     return assembled(likelihood, some, *_in_turn(chunks))
 
 
-def _looked_further(weighing: Weighing) -> Posterior:
+def looked_further(weighing: Weighing) -> Posterior:
     """Return the posterior of runs with what explains them better and is no hypothesis."""
     return replace(weighing.posterior(), unasked=unasked_faults(weighing))
 
@@ -305,7 +305,7 @@ def displaced_posterior(
 ) -> Posterior:
     """Return the posterior of runs whose sensor may be displaced."""
     parts, better = _about_the_better(likelihood, hypotheses, priors)
-    some = [_looked_further(one) for one in parts]
+    some = [looked_further(one) for one in parts]
     chunks = _chunks(likelihood)
     part, row = _in_turn(chunks)
     return assembled(likelihood, some, part + len(chunks) * better, row)

@@ -17,6 +17,7 @@ from failuretwin.core.progress import Progress, unseen
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.engine.registration import (
     displaced_components,
+    looked_further,
     registered_together,
     sensor_in_doubt,
 )
@@ -170,7 +171,7 @@ def doubted(likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors:
 
 def _posterior(judged: Judged, here: FloatArray, usual: FloatArray) -> Posterior:
     """Return the posterior of runs, with zeros that are odd by those of their kind."""
-    found = judged.weighing.posterior()
+    found = looked_further(judged.weighing)
     if not offsets_doubted(judged.weighing.likelihood.model):
         return replace(found, offsets=())
     return replace(found, offsets=odd_zeros_of(judged.weighing, usual, here))

@@ -26,6 +26,7 @@ from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.engine.registration import (
     displaced_components,
+    looked_further,
     registered_together,
     sensor_in_doubt,
 )
@@ -177,7 +178,7 @@ class LifeFilter:
             window.counted[:] = False
             window.maximise()
         self.window = self._without_oldest(window)
-        return found.weighing.posterior()
+        return looked_further(found.weighing)
 
     def see_moving(self, lag_s: float) -> float:
         """Let runs that hardly rest be followed too: lags are in doubt from now on.
