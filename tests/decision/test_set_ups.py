@@ -19,7 +19,7 @@ from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp
-from failuretwin.inference.set_up_weighing import right_in_some
+from failuretwin.inference.set_up_weighing import SetUpWeighing, right_in_some
 from failuretwin.inference.set_ups.log_correction import CorrectionTable, LogCorrection
 from failuretwin.inference.set_ups.set_ups import FAULT_OF_EVERY_RUN, SetUp, mistakes, zero_off
 from failuretwin.inference.set_ups.wrong_setup import ANOTHER
@@ -65,6 +65,20 @@ def same_verdicts(found, expected):
     for one, other in zip(found, expected, strict=True):
         assert one.diagnosis == other.diagnosis
         assert one.posterior == pytest.approx(other.posterior, abs=0.03)
+
+
+def test_no_set_up_is_tried_by_which_joints_turn_round_and_round(some_faults, runs, armpi):
+    """A tool said to be in millimetres is near whatever such commands ask for."""
+    seen = some_faults.seen(runs)
+    told = seen.sample.evidence.movements.target
+    weighing = SetUpWeighing(seen.sample, seen.hypotheses, seen.priors)
+    units = [one for one in mistakes(armpi) if one.kind == "unit"]
+    tried = weighing.nearest([two.beside(one) for one in units for two in units])
+    assert tried
+    for one in tried:
+        assert np.nanmax(np.abs(one.correction.command(told))) < 20.0
+    wild = [one for one in units if "radians taken for degrees" in one.what]
+    assert weighing.nearest(wild) == wild  # there is nothing else
 
 
 # Corrections.

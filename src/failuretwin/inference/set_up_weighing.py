@@ -37,7 +37,14 @@ from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.robot_mixture import robot_components
 from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp, with_doubt
 from failuretwin.inference.set_ups.log_correction import LogCorrection
-from failuretwin.inference.set_ups.set_ups import FEWEST_TO_TURN, SetUp, mistakes, turned, zero_off
+from failuretwin.inference.set_ups.set_ups import (
+    FEWEST_TO_TURN,
+    MOST_RAD,
+    SetUp,
+    mistakes,
+    turned,
+    zero_off,
+)
 
 FEW = 8
 """Runs that set-ups are weighed by, evenly spread: five name what shows."""
@@ -236,7 +243,8 @@ class SetUpWeighing:
     def nearest(self, set_ups: Sequence[SetUp]) -> list[SetUp]:
         """Return the set-ups that bring the tool nearest to where healthy commands would have it.
 
-        Movements that stay far off count alike, however far: some may be faulty.
+        Movements that stay far off count alike, however far: some may be faulty. Commands by which
+        joints turn round and round are none, unless all set-ups make such.
         """
         evidence, usable = self.likelihood.evidence, self.likelihood.usable
         told, point = evidence.movements.target[usable], evidence.point[usable]
@@ -244,8 +252,11 @@ class SetUpWeighing:
         expected = self.likelihood.model.twin.path(commands)
         seen = np.stack([s.correction.point(point) for s in set_ups])
         away = np.linalg.norm(seen - expected, axis=-1) / (NEAR * self.robot.reach)
-        score = np.minimum(away, 1.0).mean(axis=1)
-        return [set_ups[i] for i in np.argsort(score, kind="stable")[:PROMISING]]
+        angles = np.where(self.robot.slides, 0.0, commands)
+        wild = (np.abs(angles) > MOST_RAD).any(axis=(1, 2))
+        score = np.minimum(away, 1.0).mean(axis=1) + (wild & ~wild.all())
+        order = np.argsort(score, kind="stable")[:PROMISING]
+        return [set_ups[i] for i in order if score[i] <= 1.0]
 
     # Mistakes with numbers of their own.
 
