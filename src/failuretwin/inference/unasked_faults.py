@@ -38,7 +38,7 @@ def unasked_faults(weighing: Weighing) -> list[str]:
     best = (by_hypothesis + weighing.log_odds).argmax(axis=1)
     blamed = [_motors_of(weighing.hypotheses[h]) for h in best.tolist()]
     rows = np.flatnonzero(weighing.likelihood.evidence.on_the_way & list(map(bool, blamed)))
-    others = _others(weighing, set[str]().union(*(blamed[run] for run in rows.tolist())))
+    others = _others(weighing, rows, set[str]().union(*(blamed[run] for run in rows.tolist())))
     found = [""] * len(best)
     if not others:
         return found
@@ -52,9 +52,9 @@ def unasked_faults(weighing: Weighing) -> list[str]:
     return found
 
 
-def _others(weighing: Weighing, motors: Set[str]) -> list[Hypothesis]:
-    """Return faults of some motors that are no hypotheses and show by how they move."""
-    told = weighing.layout.moving, bool(weighing.curved.any())
+def _others(weighing: Weighing, rows: IntArray, motors: Set[str]) -> list[Hypothesis]:
+    """Return faults of some motors that are no hypotheses and show on the way of some runs."""
+    told = weighing.layout.moving, bool(weighing.curved[rows].any())
     some = unlisted(weighing.likelihood, weighing.hypotheses)
     return [h for h in some if _motors_of(h) <= motors and _moves(h) and has_rows(h, *told)]
 

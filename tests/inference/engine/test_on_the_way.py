@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.interpolate import CubicSpline
 
 import failuretwin as ft
@@ -234,6 +235,18 @@ def test_a_motor_that_goes_on_again_is_not_said_to_be_stuck(stops):
     else:
         assert str(found.diagnosis) == "motor_1:stuck"
         assert found.probability > 0.99
+
+
+def test_a_motor_blamed_on_ramps_is_looked_at_beside_a_run_on_a_curve():
+    """What shows on curves alone does not count for it."""
+    ramps = zigzag(8.0)
+    stuck = ramps.copy()
+    stuck[350:, 1] = stuck[350, 1]
+    some = [exact_run(ROBOT, ramps, stuck), late_run(curve(), 0.0)]
+    some = [one.assign_coords(run=[name]) for one, name in zip(some, "ab", strict=True)]
+    blamed, healthy = ft.diagnose(xr.concat(some, "run"), ROBOT, "generic")
+    assert str(blamed.diagnosis) == "motor_2:stuck"
+    assert str(healthy.diagnosis) == "healthy"
 
 
 def test_movements_of_a_curve_do_not_speak_for_what_does_not_show_on_it():
